@@ -1,0 +1,26 @@
+"""Videos in, animated model out: the stages in the order of the data. Start reading here.
+
+videos -> frames -> masks, flow, features -> poses -> fit -> correct -> refine -> export
+
+Each entry is ``module:function``; the engine imports them by name, so that editing one stage never touches the
+code fingerprint of another.
+"""
+
+PIPELINE = (
+    "stages.frames:frames",
+    "stages.masks:masks",
+    "stages.flow:flow",
+    "stages.features:features",
+    "stages.poses:poses",
+    "stages.optimise:fit",
+    "stages.optimise:correct",
+    "stages.optimise:refine",
+    "stages.export:export",
+)
+"""The pipeline, in data order."""
+
+GROUPS = {"optimise": ("fit", "correct", "refine")}
+"""Names that stand for several stages on the command line."""
+
+PRESETS = "presets.toml"
+"""Settings by purpose, beside this file; the first table is the default preset."""
