@@ -1,0 +1,102 @@
+"""Codes in time and what they drive: body pose, root pose, environment (BANMo, sections 3.1 to 3.3).
+
+A code is a Fourier series in time, its matrix A_v separate for each video: ``omega_v(t) = A_v F(t)`` with
+``F(t) = [1, t, sin(2^k pi t), cos(2^k pi t)]_k`` and t in [-1, 1] over the video. So a code is defined at every
+instant, kept frame or not, and neighbours in time share their parameters.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from stages.geometry.rotations import rigid, so3_exp
+
+
+def octaves_for(duration_s: float, shortest_period_s: float) -> int:
+    """Octaves K so that the fastest term of F(t) has about `shortest_period_s` in a clip of `duration_s`."""
+    ratio = max(duration_s, 1e-3) / max(shortest_period_s, 1e-3)
+    return min(10, max(2, 1 + round(math.log2(max(ratio, 1.0)))))
+
+
+def fourier_basis(time: Tensor, octaves: int) -> Tensor:
+    """F(t) (N, 2 + 2K) of times (N,) in [-1, 1]."""
+    phase = time[:, None] * (math.pi * 2.0 ** torch.arange(octaves, dtype=time.dtype, device=time.device))
+    return torch.cat([torch.ones_like(time)[:, None], time[:, None], phase.sin(), phase.cos()], 1)
+
+
+class FourierCode(nn.Module):
+    """``omega_v(t) = A_v F(t)`` of C channels for V videos; higher octaves begin smaller."""
+
+    def __init__(self, videos: int, channels: int, octaves: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.octaves = octaves
+        size = 2.0 ** -torch.arange(octaves, dtype=torch.float32).clamp_max(6) * 0.5 + 0.05
+        scale = torch.cat([torch.ones(2), size, size])
+        noise = torch.randn(videos, 2 + 2 * octaves, channels, generator=generator)
+        self.coefficients = nn.Parameter(noise * scale[:, None])
+
+    def forward(self, video_idx: Tensor, time: Tensor) -> Tensor:
+        """Codes (N, C) at `time` (N,) of videos `video_idx` (N,)."""
+        basis = fourier_basis(time, self.octaves)
+        return torch.einsum("nk,nkc->nc", basis, self.coefficients[video_idx])
+
+
+class MotionHead(nn.Module):
+    """Two hidden layers from a code to `count` rigid motions: rotation vectors and translations, near zero at first."""
+
+    def __init__(self, code_channels: int, count: int, width: int, translation_scale: float) -> None:
+        super().__init__()
+        self.count, self.translation_scale = count, translation_scale
+        self.hidden1 = nn.Linear(code_channels, width)
+        self.hidden2 = nn.Linear(width, width)
+        self.out = nn.Linear(width, 6 * count)
+        nn.init.normal_(self.out.weight, std=1e-3)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotation vectors (N, count, 3) in radians and translations (N, count, 3)."""
+        hidden = torch.relu(self.hidden1(code))
+        hidden = torch.relu(self.hidden2(hidden))
+        out = self.out(hidden).reshape(len(code), self.count, 6)
+        return out[..., :3], out[..., 3:] * self.translation_scale
+
+
+class BodyPose(nn.Module):
+    """Bone transforms J_b(t), canonical to object space, from the body pose code omega_b (equations 4, 5)."""
+
+    def __init__(
+        self, videos: int, bones: int, octaves: int, code: int, width: int, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.code = FourierCode(videos, code, octaves, generator)
+        self.head = MotionHead(code, bones, width, translation_scale=0.3)
+
+    def forward(self, video_idx: Tensor, time: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+        """J (N, B, 4, 4) at `time` (N,), and the codes (N, C). A bone turns about its own centre (B, 3)."""
+        code = self.code(video_idx, time)
+        vectors, shift = self.head(code)
+        rotation = so3_exp(vectors)
+        offset = centres - (rotation @ centres[..., None]).squeeze(-1) + shift
+        return rigid(rotation, offset), code
+
+
+class RootPose(nn.Module):
+    """Correction of the initial root poses: ``G(t) = MLP_G(omega_r(t)) G_0(t)`` (BANMo, section 3.4).
+
+    The correction turns the object about the depth it stands at, not about the camera's centre, so that rotation
+    and translation stay decoupled.
+    """
+
+    def __init__(self, videos: int, octaves: int, code: int, width: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.code = FourierCode(videos, code, octaves, generator)
+        self.head = MotionHead(code, 1, width, translation_scale=0.3)
+
+    def forward(self, video_idx: Tensor, time: Tensor, base: Tensor) -> Tensor:
+        """Root poses (N, 4, 4), camera_from_object, from `base` poses (N, 4, 4) at `time` (N,)."""
+        vectors, shift = self.head(self.code(video_idx, time))
+        rotation = so3_exp(vectors[:, 0]) @ base[:, :3, :3]
+        return rigid(rotation, base[:, :3, 3] + shift[:, 0])

@@ -1,0 +1,94 @@
+"""Gaussian bones and their skinning weights (BANMo, section 3.2, equations 6 to 8).
+
+A bone b is an anisotropic Gaussian in canonical space: centre C_b, orientation V_b, standard deviations
+exp(log_scale_b). The skinning score of a point is minus half its squared Mahalanobis distance, plus a learned
+delta; weights are the softmax of the scores over the bones.
+
+The quadratic form is evaluated as a product of the point's 10 monomials (1, x, y, z, x^2, y^2, z^2, xy, xz, yz)
+with a 10 x B matrix a frame: one small matrix product in place of B differences a point.
+
+Axes: frame F, point N, bone B. Units are those of canonical space (the object is about 2 long).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from stages.geometry.rotations import quaternion_to_matrix
+
+
+class Bones(nn.Module):
+    """B Gaussian bones: ``centres`` (B, 3), ``quaternions`` (B, 4), ``log_scales`` (B, 3)."""
+
+    def __init__(self, centres: Tensor, log_scales: Tensor) -> None:
+        super().__init__()
+        self.centres = nn.Parameter(centres.clone())
+        identity = torch.tensor([1.0, 0, 0, 0]).expand(len(centres), 4)
+        self.quaternions = nn.Parameter(identity.clone())
+        self.log_scales = nn.Parameter(log_scales.clone())
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def orientations(self) -> Tensor:
+        """(B, 3, 3): columns are the Gaussians' principal axes."""
+        return quaternion_to_matrix(self.quaternions)
+
+
+def monomials(points: Tensor) -> Tensor:
+    """(..., N, 10): 1, x, y, z, x^2, y^2, z^2, xy, xz, yz of points (..., N, 3)."""
+    x, y, z = points.unbind(-1)
+    return torch.stack([torch.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], -1)
+
+
+def score_coefficients(centres: Tensor, orientations: Tensor, log_scales: Tensor) -> Tensor:
+    """Coefficients (..., 10, B) with ``monomials(x) @ coefficients == -0.5 (x - C)^T V S^-2 V^T (x - C)``.
+
+    `centres` (..., B, 3), `orientations` (..., B, 3, 3), `log_scales` (B, 3) or (..., B, 3).
+    """
+    scaled = orientations * torch.exp(-log_scales)[..., None, :]
+    precision = scaled @ scaled.transpose(-1, -2)
+    linear = (precision @ centres[..., None]).squeeze(-1)
+    constant = -0.5 * (linear * centres).sum(-1)
+    p = precision
+    rows = [
+        constant, linear[..., 0], linear[..., 1], linear[..., 2],
+        -0.5 * p[..., 0, 0], -0.5 * p[..., 1, 1], -0.5 * p[..., 2, 2],
+        -p[..., 0, 1], -p[..., 0, 2], -p[..., 1, 2],
+    ]  # fmt: skip
+    return torch.stack(rows, -2)
+
+
+def skinning_weights(points: Tensor, coefficients: Tensor, delta: Tensor | None = None) -> Tensor:
+    """Softmax skinning weights (F, N, B) of points (F, N, 3) under `coefficients` (F, 10, B) (equation 8)."""
+    scores = monomials(points) @ coefficients
+    if delta is not None:
+        scores = scores + delta
+    return scores.softmax(-1)
+
+
+def blend(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
+    """Linear blend skinning: ``sum_b w_b J_b x`` of points (F, N, 3), weights (F, N, B), transforms (F, B, 4, 4)."""
+    flat = transforms[..., :3, :].reshape(*transforms.shape[:-2], 12)
+    matrices = (weights @ flat).reshape(*points.shape[:-1], 3, 4)
+    return (matrices[..., :3] * points[..., None, :]).sum(-1) + matrices[..., 3]
+
+
+class DeltaSkinning(nn.Module):
+    """Learned correction of the skinning scores, ``MLP_delta(X, omega_b)`` (equation 8); zero at the start."""
+
+    def __init__(self, bones: int, code_channels: int, width: int = 64) -> None:
+        super().__init__()
+        self.point_layer = nn.Linear(10, width)
+        self.code_layer = nn.Linear(code_channels, width, bias=False)
+        self.hidden = nn.Linear(width, width)
+        self.out = nn.Linear(width, bones)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, points: Tensor, code: Tensor) -> Tensor:
+        """(F, N, B) score corrections at points (F, N, 3) with pose codes (F, C)."""
+        hidden = torch.relu(self.point_layer(monomials(points)) + self.code_layer(code)[:, None])
+        return self.out(torch.relu(self.hidden(hidden)))
