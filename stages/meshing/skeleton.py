@@ -1,0 +1,172 @@
+"""A tree of joints from loose bones, by what stays together in motion and lies close at rest; and skin weights for it.
+
+Bones in the model are independent Gaussians, each with its own rigid motion. A rig is a tree. The cost of joining two
+bones is how badly the best common joint between them holds over all frames, plus how far they lie apart at rest; the
+tree is the one of least total cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joints in an order in which parents come before children.
+
+    names: one a joint, e.g. ``bone_07``.
+    bone: (B,) index of each joint's bone in the model.
+    parent: (B,) index of the parent joint, -1 for the root (which is joint 0).
+    rest: (B, 4, 4) object_from_joint at rest, rigid, float64.
+    """
+
+    names: list[str]
+    bone: np.ndarray
+    parent: np.ndarray
+    rest: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def joint_of_bone(self) -> np.ndarray:
+        """(B,) joint index of each bone of the model."""
+        inverse = np.empty(len(self), np.int64)
+        inverse[self.bone] = np.arange(len(self))
+        return inverse
+
+    def posed(self, bone_transforms: np.ndarray) -> np.ndarray:
+        """Object_from_joint (T, B, 4, 4), joint order, of canonical-to-posed bone transforms (T, B, 4, 4), bone order."""
+        return nearest_rigid(bone_transforms[:, self.bone].astype(np.float64)) @ self.rest
+
+    def local(self, posed: np.ndarray) -> np.ndarray:
+        """Parent_from_joint (..., B, 4, 4) of object_from_joint (..., B, 4, 4); the root's is its own."""
+        result = posed.copy()
+        child = np.flatnonzero(self.parent >= 0)
+        result[..., child, :, :] = invert(posed[..., self.parent[child], :, :]) @ posed[..., child, :, :]
+        return result
+
+
+def nearest_rigid(transforms: np.ndarray) -> np.ndarray:
+    """Rigid transforms (..., 4, 4) nearest to given ones in the Frobenius norm (polar decomposition), float64."""
+    result = np.zeros(transforms.shape, np.float64)
+    u, _, vt = np.linalg.svd(transforms[..., :3, :3].astype(np.float64))
+    flip = np.ones(u.shape[:-1])
+    flip[..., 2] = np.linalg.det(u @ vt)
+    result[..., :3, :3] = (u * flip[..., None, :]) @ vt
+    result[..., :3, 3] = transforms[..., :3, 3]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def invert(transforms: np.ndarray) -> np.ndarray:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    result = np.zeros_like(transforms)
+    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ transforms[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def joint_costs(centres: np.ndarray, transforms: np.ndarray, length: float) -> np.ndarray:
+    """Cost (B, B) of joining each pair of bones, symmetric, zero on the diagonal, in units of the object's length.
+
+    For bones a and b with motions J_a(t), J_b(t) the joint is the point p that minimises
+    ``mean_t |J_a(t) p - J_b(t) p|^2 + w |p - (c_a + c_b) / 2|^2``; the cost is the root of the first term at p, plus
+    the distance of the centres.
+
+    Args:
+        centres: (B, 3) at rest.
+        transforms: (T, B, 4, 4) canonical to posed.
+        length: longest edge of the object's box.
+    """
+    count = len(centres)
+    first, second = np.triu_indices(count, 1)
+    difference = transforms[:, first] - transforms[:, second]
+    a, b = difference[..., :3, :3], difference[..., :3, 3]
+    middle = (centres[first] + centres[second]) / 2
+    pull = 0.02
+    normal = np.einsum("tpij,tpik->pjk", a, a) / len(a) + pull * np.eye(3)
+    right = -np.einsum("tpij,tpi->pj", a, b) / len(a) + pull * middle
+    joint = np.linalg.solve(normal, right[..., None])[..., 0]
+    slip = np.sqrt((np.einsum("tpij,pj->tpi", a, joint) + b).__pow__(2).sum(-1).mean(0))
+    apart = np.linalg.norm(centres[first] - centres[second], axis=1)
+    cost = np.zeros((count, count))
+    cost[first, second] = cost[second, first] = (2.0 * slip + apart) / length
+    return cost
+
+
+def build_skeleton(
+    centres: np.ndarray,
+    orientations: np.ndarray,
+    transforms: np.ndarray,
+    weights: np.ndarray,
+    vertices: np.ndarray,
+) -> Skeleton:
+    """Join the model's bones into a tree.
+
+    The root is the bone from which the others, weighted by the surface they move, are nearest along the tree.
+
+    Args:
+        centres: (B, 3); orientations: (B, 3, 3): bones at rest, canonical space.
+        transforms: (T, B, 4, 4) canonical to posed, over all clips.
+        weights: (V, B) skinning weights at rest.
+        vertices: (V, 3) surface at rest.
+    """
+    count = len(centres)
+    length = float(np.ptp(vertices, axis=0).max())
+    rest = np.tile(np.eye(4), (count, 1, 1))
+    rest[:, :3, :3], rest[:, :3, 3] = orientations, centres
+    rest = nearest_rigid(rest)
+    share = weights.mean(axis=0)
+    if count == 1:
+        order, parent = np.zeros(1, np.int64), np.full(1, -1)
+    else:
+        # Bones that share skin belong together: overlap makes an edge up to a third cheaper.
+        overlap = weights.T @ weights
+        overlap = overlap / np.sqrt(np.maximum(np.outer(np.diag(overlap), np.diag(overlap)), 1e-12))
+        cost = joint_costs(centres.astype(np.float64), transforms.astype(np.float64), length) * (1 - overlap / 3)
+        tree = sparse.csgraph.minimum_spanning_tree(sparse.csr_matrix(np.maximum(cost, 1e-9) * (1 - np.eye(count))))
+        along = sparse.csgraph.shortest_path(tree, directed=False)
+        root = int((along @ (share + 1e-6)).argmin())
+        order, before = sparse.csgraph.breadth_first_order(tree, root, directed=False)
+        position = np.empty(count, np.int64)
+        position[order] = np.arange(count)
+        parent = np.where(before[order] < 0, -1, position[np.maximum(before[order], 0)])
+    names = [f"bone_{int(b):02d}" for b in order]
+    return Skeleton(names, order.astype(np.int64), parent.astype(np.int64), rest[order])
+
+
+def top_influences(weights: np.ndarray, influences: int) -> tuple[np.ndarray, np.ndarray]:
+    """The largest weights of each vertex, descending and made to sum to one in float32.
+
+    Args:
+        weights: (V, B), rows sum to one.
+        influences: how many to keep.
+
+    Returns:
+        Column indices (V, K) int64 and weights (V, K) float32 with K = min(influences, B); index 0 where weight is 0.
+    """
+    kept = min(influences, weights.shape[1])
+    index = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
+    value = np.take_along_axis(weights, index, axis=1).astype(np.float64)
+    value[value < 1e-4 * value[:, :1]] = 0.0
+    value = (value / value.sum(axis=1, keepdims=True)).astype(np.float32)
+    value[:, 0] += (1.0 - value.astype(np.float64).sum(axis=1)).astype(np.float32)
+    return np.where(value > 0, index, 0), value
+
+
+def blend(vertices: np.ndarray, transforms: np.ndarray, index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Linear blend skinning (T, V, 3): ``sum_k weight_k J_index_k x``.
+
+    Args:
+        vertices: (V, 3); transforms: (T, B, 4, 4) canonical to posed; index, weight: (V, K).
+    """
+    rows = np.repeat(np.arange(len(vertices)), index.shape[1])
+    matrix = sparse.csr_matrix((weight.ravel(), (rows, index.ravel())), shape=(len(vertices), transforms.shape[1]))
+    homogeneous = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
+    blended = np.stack([(matrix @ t.reshape(len(t), 16)).reshape(-1, 4, 4)[:, :3] for t in transforms])
+    return np.einsum("tvij,vj->tvi", blended, homogeneous)
