@@ -1,0 +1,91 @@
+# banmo-pipeline: videos in, animatable 3D model out.   make help
+#
+#   make reconstruct VIDEOS=clips/      your clips (without VIDEOS: sample clips made on the spot)
+#   make test                           every test
+#
+# Each target sets itself up on a fresh machine: Python 3.11 or newer with venv is all it needs.
+
+PY        ?= python3
+VENV      ?= .venv
+TORCH     ?= torch==2.13.0
+# Where pip is told to look for anything else, or how: PIP="... -q"
+PIP       ?= "$(VENV)/bin/python" -m pip --disable-pip-version-check
+
+VIDEOS    ?=
+WORKSPACE ?= workspace
+PRESET    ?=
+STAGE     ?=
+VIDEO     ?=
+ARGS      ?=
+
+# On a CPU shared with others, OpenMP threads that spin while they wait make torch many times slower.
+export GOMP_SPINCOUNT ?= 2000
+
+SHELL  := /bin/bash
+BANMO   = "$(VENV)/bin/banmo"
+PYTHON  = "$(VENV)/bin/python"
+SAMPLES = build/sample-clips
+# A stamp, not the folder, says that set-up is complete; a changed pyproject.toml sets up again.
+STAMP   = $(subst $(space),\ ,$(VENV))/.ready
+empty  :=
+space  := $(empty) $(empty)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup reconstruct stage status why inspect report view verify samples test soak lint bench docs clean
+
+help:  ## this list
+	@awk -F ':.*##' '/^[a-z-]+:.*##/ {printf "  make %-12s %s\n", $$1, $$2}' Makefile
+	@echo
+	@echo "  VIDEOS=clips/  WORKSPACE=workspace  PRESET=preview  STAGE=masks  VIDEO=cat-00  ARGS='--fit.minutes 3'"
+
+setup: $(STAMP)  ## a virtual environment with everything in it
+$(STAMP): pyproject.toml
+	"$(PY)" -c 'import sys; sys.exit("Python 3.11 or newer is needed; this is " + sys.version.split()[0] + "; name another with PY=") if sys.version_info < (3, 11) else None'
+	test -x "$(VENV)/bin/python" || "$(PY)" -m venv "$(VENV)"
+	$(PIP) install -q "$(TORCH)"
+	$(PIP) install -q -e '.[dev]'
+	touch "$(VENV)/.ready"
+
+samples: $(STAMP)  ## three short clips of a generated animal, in build/sample-clips
+	@test -n "$$(ls $(SAMPLES)/*.mp4 2>/dev/null)" || { rm -rf $(SAMPLES).part && \
+	  $(PYTHON) -m synthetic.clips $(SAMPLES).part && rm -rf $(SAMPLES) && mv $(SAMPLES).part $(SAMPLES); }
+
+ifeq ($(strip $(VIDEOS)),)
+reconstruct: samples
+endif
+reconstruct: $(STAMP)  ## clips in VIDEOS -> WORKSPACE/exports/model.glb
+	@$(BANMO) run "$(if $(strip $(VIDEOS)),$(VIDEOS),$(SAMPLES))" --workspace "$(WORKSPACE)" $(if $(PRESET),--preset "$(PRESET)") $(if $(STAGE),--stage "$(STAGE)") $(ARGS)
+
+stage: $(STAMP)  ## run again one STAGE and what it needs
+	@test -n "$(STAGE)" || { echo "say which: make stage STAGE=masks"; exit 2; }
+	@$(BANMO) run $(if $(VIDEOS),"$(VIDEOS)") --workspace "$(WORKSPACE)" --stage "$(STAGE)" $(ARGS)
+
+status: $(STAMP)  ## what is done, what is to do
+	@$(BANMO) status --workspace "$(WORKSPACE)" $(ARGS)
+
+why: $(STAMP)  ## why STAGE (of VIDEO) would run
+	@test -n "$(STAGE)" || { echo "say which: make why STAGE=masks"; exit 2; }
+	@$(BANMO) why "$(STAGE)" $(if $(VIDEO),"$(VIDEO)") --workspace "$(WORKSPACE)" $(ARGS)
+
+inspect: $(STAMP)  ## what is in the result of STAGE (of VIDEO)
+	@test -n "$(STAGE)" || { echo "say which: make inspect STAGE=masks"; exit 2; }
+	@$(BANMO) inspect "$(STAGE)" $(if $(VIDEO),"$(VIDEO)") --workspace "$(WORKSPACE)" $(ARGS)
+
+verify: $(STAMP)  ## read every stored byte and compare digests
+	@$(BANMO) verify --deep --workspace "$(WORKSPACE)" $(ARGS)
+
+test: $(STAMP)  ## every test
+	$(PYTHON) -m pytest $(ARGS)
+
+soak: $(STAMP)  ## kill the pipeline at 20 random moments and compare with an undisturbed run
+	BANMO_SOAK=20 $(PYTHON) -m pytest tests/end_to_end/test_kill.py -s $(ARGS)
+
+lint: $(STAMP)  ## style
+	$(PYTHON) -m ruff check .
+	$(VENV)/bin/lint-imports
+
+docs: $(STAMP)  ## write the settings template and the settings page from the code
+	$(PYTHON) -m workspace_template.generate
+
+clean:  ## remove build products; workspaces and the environment stay
+	rm -rf build .pytest_cache .hypothesis .ruff_cache .import_linter_cache

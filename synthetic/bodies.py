@@ -1,0 +1,301 @@
+"""Animals we generate: a smooth watertight surface on a skeleton, with soft skinning weights.
+
+Nothing flows in but proportions; a :class:`Body` flows out. Space: object space, y up, z to the front, x to the
+animal's left, the longest edge of the rest shape's box is 2 units, the box is centred on the origin.
+
+The surface is a smooth union of round cones laid along the bones, meshed once by marching cubes. A vertex takes its
+skinning weights from the bones whose cones are near it, restricted to the neighbours of the nearest bone in the
+skeleton, so that a left leg never pulls at a right one; then weights are smoothed along the mesh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from scipy import sparse
+from skimage.measure import marching_cubes
+
+
+@dataclass(frozen=True)
+class QuadrupedShape:
+    """Proportions of a quadruped; lengths in units of the distance from hip to shoulder."""
+
+    leg: float = 0.66
+    """Height of the hip above the ground."""
+    stance: float = 0.125
+    """Half the distance between left and right feet."""
+    chest: float = 0.2
+    """Radius of the rib cage."""
+    belly: float = 0.165
+    """Radius of the loin."""
+    haunch: float = 0.15
+    """Radius of the thigh's muscle."""
+    limb: float = 0.052
+    """Radius of a leg at the wrist and hock."""
+    paw: float = 0.06
+    """Radius of a paw."""
+    neck: float = 0.32
+    """Length of the neck."""
+    neck_girth: float = 0.115
+    """Radius of the neck."""
+    neck_pitch_deg: float = 38.0
+    """How steeply the neck rises."""
+    skull: float = 0.135
+    """Radius of the skull."""
+    muzzle: float = 0.17
+    """Length of the muzzle in front of the skull."""
+    muzzle_girth: float = 0.07
+    """Radius of the muzzle."""
+    ear: float = 0.17
+    """Length of an ear."""
+    ear_droop: float = 0.0
+    """0: ears stand; 1: they hang."""
+    tail: float = 0.75
+    """Length of the tail."""
+    tail_girth: float = 0.055
+    """Radius of the tail."""
+    tail_pitch_deg: float = -20.0
+    """Direction of the tail at its root: 0 straight back, 90 up."""
+
+
+CAT = QuadrupedShape()
+DOG = QuadrupedShape(
+    leg=0.78, chest=0.215, belly=0.15, neck=0.36, neck_pitch_deg=48, skull=0.125, muzzle=0.26, muzzle_girth=0.075,
+    ear=0.16, ear_droop=0.85, tail=0.55, tail_girth=0.045, tail_pitch_deg=25,
+)  # fmt: skip
+FOX = QuadrupedShape(
+    leg=0.68, chest=0.18, belly=0.145, haunch=0.135, limb=0.042, paw=0.05, neck=0.28, muzzle=0.24, muzzle_girth=0.055,
+    skull=0.122, ear=0.21, tail=0.85, tail_girth=0.11, tail_pitch_deg=-25,
+)  # fmt: skip
+KINDS = {"cat": CAT, "dog": DOG, "fox": FOX}
+"""Named proportions."""
+
+
+def vary(shape: QuadrupedShape, rng: np.random.Generator, amount: float = 0.08) -> QuadrupedShape:
+    """Another individual of the same kind: every proportion changed by about `amount` of itself."""
+    factors = {f.name: getattr(shape, f.name) * float(np.exp(rng.normal(0, amount))) for f in fields(shape)}
+    factors["ear_droop"] = float(np.clip(factors["ear_droop"], 0, 1))
+    return replace(shape, **factors)
+
+
+@dataclass(frozen=True)
+class Bone:
+    """One bone of a skeleton: it turns about `joint`; its parent is an index, -1 for the root."""
+
+    name: str
+    parent: int
+    joint: np.ndarray  # (3,) rest position, object space
+    tip: np.ndarray  # (3,) rest position of its far end
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rest shape with its skeleton. V vertices, F faces, B bones; all in object space at rest."""
+
+    vertices: np.ndarray  # (V, 3) float64
+    faces: np.ndarray  # (F, 3) int64, outward
+    weights: np.ndarray  # (V, B) float64, rows sum to 1
+    bones: tuple[Bone, ...]
+    marks: dict[str, tuple[np.ndarray, float]] = field(default_factory=dict)  # name -> centre (3,), radius
+
+    @property
+    def ground(self) -> float:
+        """Height (y) of the soles at rest."""
+        return float(self.vertices[:, 1].min())
+
+    def index(self, name: str) -> int:
+        """Index of a bone by name."""
+        return next(i for i, bone in enumerate(self.bones) if bone.name == name)
+
+    def skin(self, transforms: np.ndarray) -> np.ndarray:
+        """Linear blend skinning: (B, 4, 4) rest-to-posed bone transforms -> (V, 3) posed vertices."""
+        blended = (self.weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
+        return np.einsum("vij,vj->vi", blended[:, :, :3], self.vertices) + blended[:, :, 3]
+
+
+@dataclass(frozen=True)
+class _Cone:
+    """A round cone from `a` to `b`, squeezed by `squeeze` along `axis`, joined with blending radius `blend`."""
+
+    bone: str
+    a: np.ndarray
+    b: np.ndarray
+    ra: float
+    rb: float
+    blend: float = 0.05
+    axis: np.ndarray | None = None
+    squeeze: float = 1.0
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Approximate signed distance of (N, 3) points, negative inside."""
+        p, b = points - self.a, self.b - self.a
+        if self.axis is not None:
+            along = self.axis / np.linalg.norm(self.axis)
+            p = p + np.outer(p @ along, along) * (1.0 / self.squeeze - 1.0)
+            b = b + (b @ along) * along * (1.0 / self.squeeze - 1.0)
+        t = np.clip(p @ b / max(float(b @ b), 1e-9), 0, 1)
+        d = np.linalg.norm(p - t[:, None] * b, axis=1) - (self.ra + (self.rb - self.ra) * t)
+        return d * min(1.0, self.squeeze)
+
+
+def quadruped(shape: QuadrupedShape = CAT, cells: int = 150) -> Body:
+    """Build a quadruped; `cells` marching-cubes cells along its length."""
+    bones, cones, marks = _plan(shape)
+    vertices, faces = _surface(cones, cells)
+    weights = _weights(vertices, faces, bones, cones)
+    low, high = vertices.min(0), vertices.max(0)
+    centre, scale = (low + high) / 2, 2.0 / float((high - low).max())
+    placed = tuple(replace(b, joint=(b.joint - centre) * scale, tip=(b.tip - centre) * scale) for b in bones)
+    placed_marks = {name: ((c - centre) * scale, r * scale) for name, (c, r) in marks.items()}
+    return Body((vertices - centre) * scale, faces, weights, placed, placed_marks)
+
+
+def _plan(s: QuadrupedShape) -> tuple[list[Bone], list[_Cone], dict[str, tuple[np.ndarray, float]]]:
+    """Joints and flesh of a quadruped standing at rest, soles at y = 0."""
+    bones: list[Bone] = []
+    cones: list[_Cone] = []
+
+    def bone(name: str, parent: str | None, joint: np.ndarray, tip: np.ndarray) -> None:
+        names = [b.name for b in bones]
+        bones.append(Bone(name, -1 if parent is None else names.index(parent), np.array(joint), np.array(tip)))
+
+    def flesh(name: str, a: np.ndarray, b: np.ndarray, ra: float, rb: float, blend: float = 0.05, **kw: object) -> None:
+        cones.append(_Cone(name, np.asarray(a, float), np.asarray(b, float), ra, rb, blend, **kw))  # type: ignore[arg-type]
+
+    def at(*xyz: float) -> np.ndarray:
+        return np.array(xyz, float)
+
+    side_axis = at(1, 0, 0)
+    top = s.leg + 0.10  # the back's line of joints
+    pelvis, loin, chest, withers = at(0, top, -0.5), at(0, top + 0.015, -0.18), at(0, top, 0.14), at(0, top + 0.03, 0.46)
+    bone("pelvis", None, pelvis, loin)
+    bone("loin", "pelvis", loin, chest)
+    bone("chest", "loin", chest, withers)
+    flesh("pelvis", pelvis + at(0, -0.035, 0.0), loin + at(0, -0.06, 0), s.haunch * 1.05, s.belly, 0.1, axis=side_axis, squeeze=0.9)
+    flesh("loin", loin + at(0, -0.07, 0), chest + at(0, -0.08, 0), s.belly, s.chest * 0.97, 0.1, axis=side_axis, squeeze=0.88)
+    flesh("chest", chest + at(0, -0.085, 0), withers + at(0, -0.1, -0.05), s.chest, s.chest * 0.86, 0.1, axis=side_axis, squeeze=0.84)
+
+    up = np.deg2rad(s.neck_pitch_deg)
+    head = withers + s.neck * at(0, np.sin(up), np.cos(up))
+    middle = (withers + head) / 2 + at(0, 0.0, 0.01)
+    brow = head + at(0, 0.02, s.skull * 0.7)
+    nose = brow + at(0, -0.32 * s.skull - 0.1 * s.muzzle, s.skull * 0.45 + s.muzzle)
+    bone("neck", "chest", withers, middle)
+    bone("neck2", "neck", middle, head)
+    bone("head", "neck2", head, nose)
+    flesh("neck", withers + at(0, -0.05, -0.02), middle, s.neck_girth * 1.3, s.neck_girth, 0.09)
+    flesh("neck2", middle, head, s.neck_girth, s.neck_girth * 0.9, 0.06)
+    flesh("head", head + at(0, 0.01, 0.01), brow, s.skull * 0.92, s.skull * 0.9, 0.05)
+    flesh("head", brow + at(0, -0.35 * s.skull, 0), nose, s.muzzle_girth * 1.45, s.muzzle_girth * 0.8, 0.06)
+    for sign, side in ((1.0, "left"), (-1.0, "right")):
+        cheek = brow + at(sign * 0.45 * s.skull, -0.42 * s.skull, -0.1 * s.skull)
+        flesh("head", cheek, cheek + at(0, 0, 0.3 * s.skull), 0.5 * s.skull, 0.42 * s.skull, 0.05)
+        root = head + at(sign * 0.6 * s.skull, 0.62 * s.skull, 0.3 * s.skull)
+        stand, hang = at(sign * 0.42, 0.9, -0.05), at(sign * 0.75, -0.65, 0.05)
+        tip = root + s.ear * ((1 - s.ear_droop) * stand + s.ear_droop * hang)
+        bone(f"ear_{side}", "head", root, tip)
+        front = at(sign * 0.45, 0.1, 0.9) if s.ear_droop < 0.5 else at(sign * 0.9, 0.3, 0.1)
+        flesh(f"ear_{side}", root + at(0, -0.02, 0), tip, 0.078, 0.016, 0.018, axis=front, squeeze=0.36)
+
+    slope, links = np.deg2rad(s.tail_pitch_deg), 5
+    joint, parent = pelvis + at(0, 0.04, -s.haunch * 0.85), "pelvis"
+    for i in range(links):
+        bend = slope + np.deg2rad(9.0) * i
+        tip = joint + s.tail / links * at(0, np.sin(bend), -np.cos(bend))
+        bone(f"tail{i}", parent, joint, tip)
+        thick = [0.75, 0.95, 1.0, 0.95, 0.85, 0.45]
+        flesh(f"tail{i}", joint, tip, s.tail_girth * thick[i], s.tail_girth * thick[i + 1], 0.03 if i else 0.05)
+        joint, parent = tip, f"tail{i}"
+
+    for sign, side in ((1.0, "left"), (-1.0, "right")):
+        x, h = sign * s.stance, s.leg
+        shoulder, elbow = at(x * 0.9, h * 0.93, 0.42), at(x, h * 0.54, 0.30)
+        wrist, sole, toe = at(x, h * 0.2, 0.37), at(x, s.paw * 0.8, 0.37), at(x, s.paw * 0.72, 0.37 + 1.25 * s.paw)
+        bone(f"arm_{side}", "chest", shoulder, elbow)
+        bone(f"forearm_{side}", f"arm_{side}", elbow, wrist)
+        bone(f"hand_{side}", f"forearm_{side}", wrist, sole)
+        flesh(f"arm_{side}", shoulder, elbow, s.haunch * 0.72, s.limb * 1.55, 0.07)
+        flesh(f"forearm_{side}", elbow, wrist, s.limb * 1.4, s.limb * 1.0, 0.04)
+        flesh(f"hand_{side}", wrist, sole, s.limb * 1.0, s.limb * 1.05, 0.03)
+        flesh(f"hand_{side}", sole, toe, s.paw, s.paw * 0.88, 0.03)
+        hip, knee = at(x * 0.85, h * 0.97, -0.47), at(x * 1.05, h * 0.58, -0.34)
+        hock, heel = at(x, h * 0.29, -0.57), at(x, s.paw * 0.8, -0.52)
+        bone(f"thigh_{side}", "pelvis", hip, knee)
+        bone(f"shin_{side}", f"thigh_{side}", knee, hock)
+        bone(f"foot_{side}", f"shin_{side}", hock, heel)
+        flesh(f"thigh_{side}", hip, knee, s.haunch * 0.95, s.limb * 1.75, 0.07)
+        flesh(f"shin_{side}", knee, hock, s.limb * 1.6, s.limb * 0.95, 0.04)
+        flesh(f"foot_{side}", hock, heel, s.limb * 0.95, s.limb * 1.0, 0.03)
+        flesh(f"foot_{side}", heel, heel + at(0, -0.005, 1.3 * s.paw), s.paw, s.paw * 0.88, 0.03)
+
+    marks = {"nose": (nose + at(0, 0.35 * s.muzzle_girth, 0.62 * s.muzzle_girth), 0.5 * s.muzzle_girth)}
+    for sign, side in ((1.0, "left"), (-1.0, "right")):
+        marks[f"eye_{side}"] = (brow + at(sign * 0.56 * s.skull, 0.16 * s.skull, 0.72 * s.skull), 0.2 * s.skull)
+    return bones, cones, marks
+
+
+def _surface(cones: list[_Cone], cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Marching cubes on the smooth union of cones: vertices and outward faces of its largest component."""
+    ends = np.array([[c.a, c.b] for c in cones]).reshape(-1, 3)
+    reach = max(max(c.ra, c.rb) for c in cones) + 0.06
+    low, high = ends.min(0) - reach, ends.max(0) + reach
+    step = float((high - low).max()) / cells
+    axes = [np.arange(lo, hi + step, step) for lo, hi in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    field = np.full(grid.shape[:3], 1.0)
+    for cone in cones:  # each cone only changes the field near itself
+        margin = max(cone.ra, cone.rb) + cone.blend + 3 * step
+        lo = np.minimum(cone.a, cone.b) - margin
+        hi = np.maximum(cone.a, cone.b) + margin
+        window = tuple(slice(*np.searchsorted(ax, [lo[i], hi[i]])) for i, ax in enumerate(axes))
+        d = cone.distance(grid[window].reshape(-1, 3)).reshape(field[window].shape)
+        field[window] = _smooth_min(field[window], d, cone.blend)
+    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(step, step, step), gradient_direction="descent")
+    vertices = vertices.astype(np.float64) + low
+    return _largest_component(vertices, faces.astype(np.int64))
+
+
+def _smooth_min(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    """Polynomial smooth minimum with blending radius `k`."""
+    h = np.clip(0.5 + 0.5 * (b - a) / k, 0, 1)
+    return b + (a - b) * h - k * h * (1 - h)
+
+
+def _largest_component(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    _, label = sparse.csgraph.connected_components(_adjacency(len(vertices), faces), directed=False)
+    keep = label == np.bincount(label).argmax()
+    renumber = np.cumsum(keep) - 1
+    return vertices[keep], renumber[faces[keep[faces[:, 0]]]]
+
+
+def _adjacency(count: int, faces: np.ndarray) -> sparse.csr_matrix:
+    """(V, V) matrix of ones where two vertices share an edge."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ones = np.ones(2 * len(pairs))
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    matrix = sparse.csr_matrix((ones, (both[:, 0], both[:, 1])), (count, count))
+    matrix.data[:] = 1.0
+    return matrix
+
+
+def _weights(vertices: np.ndarray, faces: np.ndarray, bones: list[Bone], cones: list[_Cone]) -> np.ndarray:
+    """Skinning weights (V, B): near bones of the skeleton's neighbourhood, smoothed along the surface."""
+    names = [b.name for b in bones]
+    distance = np.full((len(vertices), len(bones)), np.inf)
+    for cone in cones:
+        column = names.index(cone.bone)
+        distance[:, column] = np.minimum(distance[:, column], cone.distance(vertices))
+    near = np.eye(len(bones), dtype=bool)
+    for i, b in enumerate(bones):
+        if b.parent >= 0:
+            near[i, b.parent] = near[b.parent, i] = True
+    nearest = distance.argmin(1)
+    raw = np.exp(-(distance - distance.min(1, keepdims=True)) / 0.03) * near[nearest]
+    weights = raw / raw.sum(1, keepdims=True)
+    adjacency = _adjacency(len(vertices), faces)
+    average = sparse.diags(1.0 / np.asarray(adjacency.sum(1)).ravel()) @ adjacency
+    for _ in range(8):
+        weights = 0.5 * weights + 0.5 * (average @ weights)
+    weights[weights < 1e-3] = 0.0
+    return weights / weights.sum(1, keepdims=True)
