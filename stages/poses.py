@@ -1,0 +1,226 @@
+"""poses: root pose and intrinsics of every kept frame, given or estimated."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import BadInput, Folder, Given, Resources, Run, Scene, stage
+from stages import formats
+from stages.registration.answer import Answer, Provider, Subject
+from stages.registration.cues import CROP_MARGIN, Cues, crop_frame
+from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
+from stages.registration.placing import (
+    OBJECT_DEPTH,
+    default_intrinsics,
+    depth_from_size,
+    mask_boxes,
+    place,
+    ray_rotation,
+    smooth,
+    transforms,
+)
+from stages.registration.upright import upright
+
+CROP_PX = 48
+LOW_TRUST = 0.5
+GIVEN = ".poses.json"
+PROVIDERS: dict[str, Provider] = {"upright": upright}
+"""Providers by name, best first; `auto` takes, clip by clip, the answer that is trusted most."""
+
+
+@dataclass(frozen=True)
+class PosesSettings:
+    """Settings of the `poses` stage."""
+
+    provider: str = "auto"
+    """auto, given (refuse to guess), search, colmap or upright."""
+    focal_px: float = 0.0
+    """Focal length in pixels of the kept frames; 0 takes the file's own hint, or else the longer side."""
+    refine: bool = False
+    """Let the optimiser move root poses that were given; otherwise they are held fixed."""
+    seed: int = 0
+    """Seed of the search."""
+
+
+@stage(per=Scene, version=1, given=(GIVEN,), needs=Resources(cpus="all"))
+def poses(
+    frames: dict[str, Folder],
+    masks: dict[str, Folder],
+    flow: dict[str, Folder],
+    features: dict[str, Folder],
+    given: dict[str, Given],
+    settings: PosesSettings,
+    out: Path,
+    run: Run,
+) -> None:
+    """Root poses `<video>.json` of every clip in one common object space; `poses.json` says who found them."""
+    if settings.provider not in ("auto", "given", *PROVIDERS):
+        known = ", ".join(("auto", "given", *PROVIDERS))
+        raise BadInput(f"poses.provider is {settings.provider!r}", hint=f"known: {known}")
+    clips = {name: formats.read_clip(folder.path) for name, folder in frames.items()}
+    documents = {name: path for name, g in given.items() if (path := g.get(GIVEN)) is not None}
+    tracks = {name: read_given(documents[name], clips[name]) for name in clips if name in documents}
+    asked = [name for name in clips if name not in tracks]
+    if asked and settings.provider == "given":
+        raise BadInput(
+            f"there are no root poses beside {asked[0]}", hint=f"add {asked[0]}{GIVEN}, or set poses.provider"
+        )
+    tried: list[dict[str, object]] = []
+    answers: dict[str, Answer] = {}
+    if asked:
+        subjects = [_subject(clips[n], masks[n], flow[n], settings, tracks.get(n), n, run) for n in clips]
+        answers, tried = _ask(subjects, asked, settings, run)
+        tracks |= {s.name: _track(s, answers[s.name]) for s in subjects if s.name in answers}
+    for name, clip in clips.items():
+        formats.write_poses(out / f"{name}.json", tracks[name], clip)
+    _summarise(clips, tracks, answers, tried, settings, out, run)
+
+
+def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
+    """The user's own poses of one clip, checked, at its kept frames; pixels of the source scaled to those of the frames.
+
+    Raises:
+        BadInput: unreadable, or not what it should be.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(document, dict):
+            raise PoseDocumentError("is not a JSON object with K and object_to_camera")
+        matrices = parse_transforms(document, len(clip.source_time_s))
+        intrinsics = parse_intrinsics(document)
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, PoseDocumentError) as error:
+        what = str(error) if isinstance(error, PoseDocumentError) else f"cannot be read as JSON ({error})"
+        raise BadInput(
+            f"{path.name} {what}", hint="give K and one rigid 4x4 object_to_camera a source frame"
+        ) from error
+    info = formats.read_json(clip.root / "frames.json")
+    scale_x = clip.width / float(info.get("source_width", clip.width))
+    scale_y = clip.height / float(info.get("source_height", clip.height))
+    kept = matrices[clip.source_idx]
+    return formats.PoseTrack(
+        scale_intrinsics(intrinsics, scale_x, scale_y), kept, np.ones(len(kept)), ["given"] * len(kept)
+    )
+
+
+def _subject(
+    clip: formats.Clip,
+    masks: Folder,
+    flow: Folder,
+    settings: PosesSettings,
+    track: formats.PoseTrack | None,
+    name: str,
+    run: Run,
+) -> Subject:
+    """Read one clip into small crops; only one full frame is in memory at a time."""
+    probability = formats.read_masks(masks.path, clip)
+    boxes, known = mask_boxes(probability)
+    if not known.any():
+        raise BadInput(f"no object was found in {name}", hint="look at its masks, or give a box in its .hints.toml")
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    half = CROP_MARGIN * np.maximum(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]) / 2
+    parts = []
+    for i in range(len(clip)):
+        run.tick(i, len(clip), label=f"reading {name}")
+        path = formats.flow_path(flow.path, 1, int(clip.source_idx[i]))
+        motion = formats.read_flow(path) if path.exists() else None
+        parts.append(crop_frame(clip.image(i), probability[i], motion, centre[i], half[i], CROP_PX))
+    mask, colour, flow_px, confidence = (np.stack(part) for part in zip(*parts, strict=True))
+    edge = np.array([clip.width, clip.height, clip.width, clip.height]) - boxes
+    cut = (boxes[:, :2] <= 1).any(axis=1) | (edge[:, 2:] <= 1).any(axis=1)
+    cues = Cues(mask, colour, flow_px, confidence, centre, half, boxes, known, cut)
+    if track is None:
+        return Subject(name, cues, default_intrinsics(clip.width, clip.height, settings.focal_px or clip.focal_hint_px))
+    turned = ray_rotation(centre, track.intrinsics).transpose(0, 2, 1)
+    return Subject(name, cues, track.intrinsics, turned @ track.object_to_camera[:, :3, :3])
+
+
+def _ask(
+    subjects: list[Subject], asked: list[str], settings: PosesSettings, run: Run
+) -> tuple[dict[str, Answer], list[dict[str, object]]]:
+    """Ask the providers in order; keep for each clip the answer with the highest trust."""
+    names = list(PROVIDERS) if settings.provider == "auto" else [settings.provider, "upright"]
+    best: dict[str, Answer] = {}
+    tried: list[dict[str, object]] = []
+    for provider in dict.fromkeys(names):
+        if all(name in best for name in asked) and settings.provider != "auto":
+            break
+
+        def tell(done: int, total: int, label: str) -> None:
+            run.tick(done, total, label=label)
+            if run.stop_requested:
+                run.interrupt()
+
+        found = PROVIDERS[provider](subjects, settings.seed, tell)
+        figures = {n: {"trust": round(a.trust, 3), **a.score} for n, a in found.items()}
+        tried.append({"provider": provider, "videos": figures})
+        for name in asked:
+            if name in found and (name not in best or found[name].trust > best[name].trust):
+                best[name] = found[name]
+    return best, tried
+
+
+def _track(subject: Subject, answer: Answer) -> formats.PoseTrack:
+    """From the crop's rotations to root poses: translation from the mask's box, depth smooth in time."""
+    cues = subject.cues
+    rotation = ray_rotation(cues.centre_px, subject.intrinsics) @ answer.rotation
+    depth = depth_from_size(cues.box_px, subject.intrinsics, answer.extent)
+    depth = np.exp(smooth(np.log(depth), 3.0))
+    translation = place(cues.box_px, depth, subject.intrinsics)
+    confidence = np.where(cues.known, answer.confidence, 0.0)
+    return formats.PoseTrack(
+        subject.intrinsics, transforms(rotation, translation), confidence, [answer.provider] * len(cues)
+    )
+
+
+def _summarise(
+    clips: dict[str, formats.Clip],
+    tracks: dict[str, formats.PoseTrack],
+    answers: dict[str, Answer],
+    tried: list[dict[str, object]],
+    settings: PosesSettings,
+    out: Path,
+    run: Run,
+) -> None:
+    videos = {}
+    for name in clips:
+        answer = answers.get(name)
+        trust = 1.0 if answer is None else answer.trust
+        provider = "given" if answer is None else answer.provider
+        score = 1.0 if answer is None else float(np.mean(tracks[name].confidence))
+        fixed = answer is None and not settings.refine
+        videos[name] = {"provider": provider, "score": round(score, 4), "trust": round(trust, 4), "fixed": fixed}
+    doubtful = [n for n in clips if videos[n]["trust"] < LOW_TRUST]
+    if doubtful:
+        named = ", ".join(f"{name} (trust {100 * videos[name]['trust']:.0f} %)" for name in doubtful)
+        run.warn(
+            f"root poses are a guess for {named}: give {doubtful[0]}{GIVEN} and the like, or film a slow walk all "
+            "the way round the subject; `inspect poses` shows the guess"
+        )
+    trust = float(np.min([v["trust"] for v in videos.values()]))
+    formats.write_json(
+        out / "poses.json",
+        {
+            "providers_tried": tried or [{"provider": "given"}],
+            "won": {name: v["provider"] for name, v in videos.items()},
+            "videos": videos,
+            "trust": round(trust, 4),
+            "advice": "" if not doubtful else f"check {', '.join(doubtful)} with `inspect poses`, or give root poses",
+        },
+    )
+    run.metric("trust", trust)
+
+
+@poses.check
+def _check(out: Path, frames: dict[str, Folder]) -> None:
+    """Every clip has a rigid, finite pose in front of the camera for each of its kept frames."""
+    for name, folder in frames.items():
+        clip = formats.read_clip(folder.path)
+        track = formats.read_poses(out / f"{name}.json")
+        if len(track.object_to_camera) != len(clip):
+            raise formats.FormatError(f"{name}.json: {len(track.object_to_camera)} poses for {len(clip)} frames")
+        if (track.object_to_camera[:, 2, 3] <= 0).any():
+            raise formats.FormatError(f"{name}.json: an object behind the camera")

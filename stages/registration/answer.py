@@ -1,0 +1,45 @@
+"""What every provider of root poses is asked and what it answers. A new one (a network, say) is one more function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from stages.registration.cues import Cues
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One clip as a provider sees it. `rotation` is set where the user gave root poses: they anchor the others."""
+
+    name: str
+    cues: Cues
+    intrinsics: np.ndarray  # (3, 3) pixels
+    rotation: np.ndarray | None = None  # (T, 3, 3) object to crop camera, known exactly
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Rotations of one clip, and how far to trust them.
+
+    `rotation` (T, 3, 3) takes object space to the camera turned onto the crop's centre
+    (:func:`placing.ray_rotation` gives the real camera's); `extent` (T,) is the object's size in the picture, units:
+    the longer side of the mask's box, from which depth follows.
+    """
+
+    provider: str
+    rotation: np.ndarray
+    extent: np.ndarray
+    confidence: np.ndarray  # (T,) in 0..1
+    trust: float  # 0..1: how likely the clip as a whole is right within 45 degrees or so
+    score: dict[str, Any] = field(default_factory=dict)  # figures for poses.json
+
+
+Tell = Callable[[int, int, str], None]
+"""Progress: done, total, label. It may raise to stop the work."""
+
+Provider = Callable[[list[Subject], int, Tell], dict[str, Answer]]
+"""Subjects, seed, progress -> answers by clip name. A clip it can say nothing of is left out."""
