@@ -59,13 +59,16 @@ class QuadrupedShape:
     """Direction of the tail at its root: 0 straight back, 90 up."""
 
 
-CAT = QuadrupedShape()
+CAT = QuadrupedShape(
+    leg=0.6, chest=0.21, belly=0.185, haunch=0.17, neck=0.25, neck_girth=0.125, skull=0.15, muzzle=0.075, muzzle_girth=0.062,
+    ear=0.145,
+)  # fmt: skip
 DOG = QuadrupedShape(
-    leg=0.78, chest=0.215, belly=0.15, neck=0.36, neck_pitch_deg=48, skull=0.125, muzzle=0.26, muzzle_girth=0.075,
+    leg=0.78, chest=0.215, belly=0.15, neck=0.36, neck_pitch_deg=48, skull=0.13, muzzle=0.2, muzzle_girth=0.075,
     ear=0.16, ear_droop=0.85, tail=0.55, tail_girth=0.045, tail_pitch_deg=25,
 )  # fmt: skip
 FOX = QuadrupedShape(
-    leg=0.68, chest=0.18, belly=0.145, haunch=0.135, limb=0.042, paw=0.05, neck=0.28, muzzle=0.24, muzzle_girth=0.055,
+    leg=0.68, chest=0.185, belly=0.155, haunch=0.14, limb=0.042, paw=0.05, neck=0.28, muzzle=0.18, muzzle_girth=0.055,
     skull=0.122, ear=0.21, tail=0.85, tail_girth=0.11, tail_pitch_deg=-25,
 )  # fmt: skip
 KINDS = {"cat": CAT, "dog": DOG, "fox": FOX}

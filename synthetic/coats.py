@@ -61,7 +61,8 @@ def coat(body: Body, rng: np.random.Generator, pattern: str | None = None, palet
     base, dark, light = (np.array(c) for c in PALETTES[palette or str(rng.choice(list(PALETTES)))])
     x = body.vertices
     parts = _parts(body)
-    wobble, fine, blotch = smooth_noise(rng, 1.6), smooth_noise(rng, 9.0), smooth_noise(rng, 1.3)
+    wobble, blotch = smooth_noise(rng, 1.6), smooth_noise(rng, 1.3)
+    fine, fur = smooth_noise(rng, 9.0), smooth_noise(rng, 18.0)
 
     colour = np.tile(base, (len(x), 1))
     if pattern == "tabby":
@@ -78,8 +79,6 @@ def coat(body: Body, rng: np.random.Generator, pattern: str | None = None, palet
         colour = _mix(colour, dark, 0.9 * _step(smooth_noise(rng, 4.2)(x) + 0.15 * fine(x), 0.42, 0.12))
     else:
         colour = _mix(colour, dark, np.clip(parts["limb"] * 1.1 + parts["ear"] + 0.4 * parts["tail_tip"], 0, 1) * 0.9)
-    shade = 0.10 * blotch(x) + 0.07 * fine(x)
-    colour = colour * (1.0 + shade[:, None])
 
     soft = 0.12 * wobble(x) + 0.05 * fine(x)
     colour = _mix(colour, light, 0.8 * _step(parts["under"] + soft, 0.62, 0.18))
@@ -88,6 +87,9 @@ def coat(body: Body, rng: np.random.Generator, pattern: str | None = None, palet
         colour = _mix(colour, light, 0.9 * _step(parts["tail_tip"] + soft, 0.6, 0.12))
     if rng.random() < 0.5:
         colour = _mix(colour, light, 0.9 * _step(parts["sock"] + 0.5 * soft, 0.6, 0.12))
+
+    shade = 0.10 * blotch(x) + 0.06 * fine(x) + 0.06 * fur(x)
+    colour = colour * (1.0 + shade[:, None])
 
     iris = np.array([(0.55, 0.50, 0.15), (0.30, 0.20, 0.10), (0.35, 0.50, 0.30)][int(rng.integers(3))])
     marks = [Mark(body.marks["nose"][0], body.marks["nose"][1], np.array([0.13, 0.09, 0.09]))]

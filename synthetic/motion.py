@@ -30,7 +30,7 @@ class Performance:
     look_yaw: np.ndarray  # (N,) head to its left, radians
     look_pitch: np.ndarray  # (N,) head down, radians
     stride_s: float = 0.95
-    stride: float = 0.42  # length of a stride in units of leg length times two
+    stride: float = 0.36  # length of a stride in units of leg length times two
     energy: float = 1.0  # scales tail, bob and roll
 
 

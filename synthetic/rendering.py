@@ -112,15 +112,12 @@ def _paint(
         distance = np.linalg.norm(rest - mark.centre.astype(np.float32), axis=1)
         amount = np.clip((mark.radius - distance) / (0.12 * mark.radius) + 0.5, 0, 1)[:, None]
         colour = colour + (mark.colour.astype(np.float32) - colour) * amount
-    fur = 1.0 + 0.05 * np.sin(rest @ np.array([[61.0, 83.0, 47.0]]).T).astype(np.float32) * np.sin(
-        rest @ np.array([[-53.0, 71.0, 67.0]]).T
-    ).astype(np.float32)
     sun = np.clip((normal @ light.astype(np.float32) + 0.15) / 1.15, 0, 1)
     height = spread(in_room[:, 1:2])[:, 0]
     sky = 0.5 + 0.5 * normal[:, 1]
     sky = sky * (0.75 + 0.25 * np.clip(height / 0.5, 0, 1)) + 0.15
     shade = look.sun * sun + look.sky * sky
-    linear = np.clip(colour * fur, 0, 1) ** 2.2 * shade[:, None]
+    linear = np.clip(colour, 0, 1) ** 2.2 * shade[:, None]
     image[rows, columns] = np.clip(linear, 0, 1) ** (1 / 2.2)
 
 

@@ -125,7 +125,7 @@ def rasterise(
         pixel = first_pixel[triangle] + row[inside].astype(np.int64) * width_px + column[inside]
         reciprocal = inverse_depth[triangle]
         p0, p1, p2 = (1 - w1 - w2) * reciprocal[:, 0], w1 * reciprocal[:, 1], w2 * reciprocal[:, 2]
-        z = 1.0 / (p0 + p1 + p2)
+        z = (1.0 / (p0 + p1 + p2)).astype(np.float32)  # as the buffer, or no depth would equal its own minimum
         np.minimum.at(depth_buffer, pixel, z)
         won = np.flatnonzero(z == depth_buffer[pixel])
         winner = pixel[won]
