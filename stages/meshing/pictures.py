@@ -1,0 +1,130 @@
+"""Pictures of a rigged mesh: a turntable, and each video's frames beside the posed mesh. Plain arrays in and out."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stages.geometry.raster import project, rasterise, vertex_normals
+
+_LIGHT = np.array([-0.35, -0.55, -0.76])  # camera frame: from above, left of and behind the camera
+_PAPER = 0.93
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is drawn: faces (F, 3), sRGB colours (V, 3) in 0..1, colours of the skin weights (V, 3), tree (B,)."""
+
+    faces: np.ndarray
+    colour: np.ndarray
+    skin: np.ndarray
+    parent: np.ndarray
+
+
+def joint_palette(count: int) -> np.ndarray:
+    """(count, 3) sRGB colours in 0..1, neighbours in the list far apart in hue."""
+    return np.array([colorsys.hsv_to_rgb((j * 0.61803) % 1.0, 0.55 + 0.3 * (j % 2), 0.95) for j in range(count)])
+
+
+def scaled_size(width_px: int, height_px: int, side_px: int) -> tuple[int, int, float]:
+    """Even width and height with the longer side about `side_px`, and the scale that leads there."""
+    scale = side_px / max(width_px, height_px)
+    return max(2, round(width_px * scale / 2) * 2), max(2, round(height_px * scale / 2) * 2), scale
+
+
+def scaled_intrinsics(intrinsics: np.ndarray, width_px: int, height_px: int, new_width: int, new_height: int) -> np.ndarray:
+    """K of the same picture resized; pixel centres at half-integers make this a plain scaling of both rows."""
+    return np.diag([new_width / width_px, new_height / height_px, 1.0]) @ intrinsics
+
+
+def paint(
+    look: Look,
+    vertices_camera: np.ndarray,
+    joints_camera: np.ndarray,
+    intrinsics: np.ndarray,
+    background: np.ndarray,
+    supersample: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two pictures of the mesh before a camera: in its colour over `background`, and in its skin colours with bones.
+
+    Args:
+        vertices_camera: (V, 3); joints_camera: (B, 3), camera frame.
+        intrinsics: (3, 3) for pictures of the background's size.
+        background: (H, W, 3) in 0..1.
+        supersample: rays per pixel along each side.
+
+    Returns:
+        Two (H, W, 3) uint8 pictures.
+    """
+    height, width = background.shape[:2]
+    k = np.diag([supersample, supersample, 1.0]) @ intrinsics
+    fragments = rasterise(vertices_camera, look.faces, k, height * supersample, width * supersample)
+    attribute = np.concatenate([look.colour, look.skin, vertex_normals(vertices_camera, look.faces)], axis=1)
+    values = fragments.interpolate(look.faces, attribute)
+    normal = values[..., 6:]
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    lit = np.clip((normal @ _LIGHT)[..., None], 0, 1)
+    layers = np.concatenate(
+        [values[..., :3] * (0.72 + 0.33 * lit), values[..., 3:6] * (0.5 + 0.55 * lit), fragments.covered[..., None]], axis=-1
+    ).astype(np.float32)
+    if supersample > 1:
+        layers = layers.reshape(height, supersample, width, supersample, 7).mean(axis=(1, 3))
+    alpha = layers[..., 6:]
+    coloured = np.clip(layers[..., :3] + (1 - alpha) * background, 0, 1)
+    skinned = np.clip(layers[..., 3:6] + (1 - alpha) * _PAPER, 0, 1)
+    pictures = [np.round(p * 255).astype(np.uint8) for p in (coloured, skinned)]
+    _draw_bones(pictures[1], joints_camera, look.parent, intrinsics)
+    return pictures[0], pictures[1]
+
+
+def _draw_bones(picture: np.ndarray, joints_camera: np.ndarray, parent: np.ndarray, intrinsics: np.ndarray) -> None:
+    if (joints_camera[:, 2] < 0.05).any():
+        return
+    pixel = np.clip(project(joints_camera, intrinsics) * 16, -1e6, 1e6).astype(int)
+    for j, p in enumerate(parent):
+        if p >= 0:
+            cv2.line(picture, tuple(pixel[j].tolist()), tuple(pixel[p].tolist()), (40, 40, 40), 1, cv2.LINE_AA, 4)
+    for point in pixel:
+        cv2.circle(picture, tuple(point.tolist()), 32, (20, 20, 20), -1, cv2.LINE_AA, 4)
+
+
+def orbit(azimuth: float, elevation: float, centre: np.ndarray, distance: float) -> np.ndarray:
+    """Camera_from_object (4, 4), OpenCV, of a camera that looks at `centre`; azimuth 0 sees the front (+z), y up."""
+    direction = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
+    )
+    forward = -direction
+    right = np.cross(forward, (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ (centre + direction * distance)
+    return pose
+
+
+def turntable(look: Look, vertices: np.ndarray, joints: np.ndarray, frames: int, side_px: int) -> Iterator[np.ndarray]:
+    """One turn about the rest pose, (side, 2 side, 3) uint8 pictures: in colour, and in skin colours with bones."""
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
+    focal = 1.6 * side_px
+    distance = radius * 1.08 * np.hypot(1.6, 0.5) / 0.5
+    intrinsics = np.array([[focal, 0, side_px / 2], [0, focal, side_px / 2], [0, 0, 1]])
+    background = np.full((side_px, side_px, 3), _PAPER, np.float32)
+    for i in range(frames):
+        pose = orbit(2 * np.pi * i / frames, np.radians(12), centre, distance)
+        points = vertices @ pose[:3, :3].T + pose[:3, 3]
+        bones = joints @ pose[:3, :3].T + pose[:3, 3]
+        yield np.concatenate(paint(look, points, bones, intrinsics, background, supersample=2), axis=1)
+
+
+def overlay(
+    look: Look, vertices_camera: np.ndarray, joints_camera: np.ndarray, intrinsics: np.ndarray, frame: np.ndarray
+) -> np.ndarray:
+    """A frame (H, W, 3) uint8, the mesh in its place over the paled frame, and its bones: (H, 3 W, 3) uint8."""
+    grey = frame.astype(np.float32).mean(axis=-1, keepdims=True) / 255
+    pale = np.repeat(0.55 + 0.4 * grey, 3, axis=-1)
+    return np.concatenate([frame, *paint(look, vertices_camera, joints_camera, intrinsics, pale)], axis=1)

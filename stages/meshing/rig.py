@@ -1,0 +1,182 @@
+"""From a fitted model to a rig: surface, skin, joints; and the rig's motion in each video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.geometry.raster import vertex_normals
+from stages.meshing.skeleton import Skeleton, blend, build_skeleton, nearest_rigid, top_influences
+from stages.meshing.surface import EmptySurface, Mesh, SurfaceFacts, clean_surface, evaluate, extract
+
+_POINTS_PER_WARP = 150_000
+
+
+class Animatable(Protocol):
+    """What a fitted model must answer, float32 tensors without gradient; canonical space has y up and z front."""
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) canonical box."""
+        ...
+
+    @property
+    def bone_centres(self) -> Tensor:
+        """(B, 3)."""
+        ...
+
+    @property
+    def bone_orientations(self) -> Tensor:
+        """(B, 3, 3)."""
+        ...
+
+    @property
+    def bone_scales(self) -> Tensor:
+        """(B, 3)."""
+        ...
+
+    def sdf(self, points: Tensor) -> Tensor:
+        """(N,) signed distance at (N, 3), negative inside."""
+        ...
+
+    def colour(self, points: Tensor, video_idx: int = 0, time: float = 0.0) -> Tensor:
+        """(N, 3) sRGB in 0..1; `time` runs over -1..1 within the video."""
+        ...
+
+    def rest_weights(self, points: Tensor) -> Tensor:
+        """(N, B) skinning weights at rest."""
+        ...
+
+    def bone_transforms(self, video_idx: int, time_s: Tensor) -> Tensor:
+        """(T, B, 4, 4) canonical to object space."""
+        ...
+
+    def forward_warp(self, points: Tensor, video_idx: int, time_s: Tensor) -> Tensor:
+        """(T, N, 3) object space."""
+        ...
+
+    def root_poses(self, video_idx: int, time_s: Tensor) -> Tensor:
+        """(T, 4, 4) camera_from_object."""
+        ...
+
+    def intrinsics(self, video_idx: int) -> Tensor:
+        """(3, 3) pixels."""
+        ...
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The model at rest: surface, normals (V, 3), weights (V, B) in the model's bone order, joints."""
+
+    mesh: Mesh
+    normals: np.ndarray
+    weights: np.ndarray
+    skeleton: Skeleton
+    facts: SurfaceFacts
+
+    def skin(self, influences: int) -> tuple[np.ndarray, np.ndarray]:
+        """Joint indices and weights (V, K) of the largest influences, joint order."""
+        return top_influences(self.weights[:, self.skeleton.bone], influences)
+
+
+@dataclass(frozen=True)
+class PosedClip:
+    """The rig in one video, at T times.
+
+    vertices: (T, V, 3) float32 by the model's own warp, object space. joints: (T, B, 4, 4) object_from_joint.
+    camera_from_object: (T, 4, 4). intrinsics: (3, 3). skinning_error: influences kept -> the largest distance between
+    the model's warp and linear blend skinning with so many influences, over vertices and frames, in units of the
+    object's length.
+    """
+
+    vertices: np.ndarray
+    joints: np.ndarray
+    camera_from_object: np.ndarray
+    intrinsics: np.ndarray
+    skinning_error: dict[int, float]
+
+
+def surface_of(model: Animatable, resolution: int, face_budget: int) -> tuple[Mesh, SurfaceFacts]:
+    """The model's surface at level 0, cleaned; of a model without one, a level that encloses 2 % of its box."""
+    bounds = model.bounds.cpu().numpy().astype(np.float64)
+    try:
+        return clean_surface(extract(model.sdf, bounds, resolution), face_budget)
+    except EmptySurface:
+        axes = [np.linspace(bounds[0, k], bounds[1, k], 32) for k in range(3)]
+        values = evaluate(model.sdf, np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+        level = float(np.quantile(values, 0.02)) + 1e-4
+        return clean_surface(extract(model.sdf, bounds, min(resolution, 64), level), face_budget, level)
+
+
+def build_rig(model: Animatable, clip_times_s: Sequence[np.ndarray], resolution: int, face_budget: int) -> Rig:
+    """Extract the surface and join the bones.
+
+    Args:
+        clip_times_s: times in seconds of each video, in the model's order.
+        resolution: cells along the longest edge of the object's box.
+        face_budget: faces to keep.
+    """
+    mesh, facts = surface_of(model, resolution, face_budget)
+    weights = model.rest_weights(_points(mesh.vertices)).cpu().numpy().astype(np.float64)
+    weights = np.clip(weights, 0, None)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+    motion = [_bone_motion(model, k, times) for k, times in enumerate(clip_times_s)]
+    skeleton = build_skeleton(
+        model.bone_centres.cpu().numpy(),
+        model.bone_orientations.cpu().numpy(),
+        np.concatenate(motion),
+        weights,
+        mesh.vertices,
+    )
+    return Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts)
+
+
+def pose_clip(model: Animatable, rig: Rig, video_idx: int, time_s: np.ndarray) -> PosedClip:
+    """The rig at times (T,) in seconds of one video."""
+    points = _points(rig.mesh.vertices)
+    per_pass = max(1, _POINTS_PER_WARP // len(points))
+    warped = [
+        model.forward_warp(points, video_idx, _seconds(time_s[i : i + per_pass])).cpu().numpy()
+        for i in range(0, len(time_s), per_pass)
+    ]
+    vertices = np.concatenate(warped).astype(np.float32)
+    transforms = nearest_rigid(_bone_motion(model, video_idx, time_s))
+    error = {}
+    for influences in (8, 4):
+        index, weight = top_influences(rig.weights, influences)
+        worst = [
+            np.linalg.norm(blend(rig.mesh.vertices, transforms[t : t + 1], index, weight) - vertices[t], axis=-1).max()
+            for t in range(len(time_s))
+        ]
+        error[influences] = float(max(worst)) / max(rig.mesh.length, 1e-12)
+    return PosedClip(
+        vertices,
+        rig.skeleton.posed(transforms),
+        nearest_rigid(model.root_poses(video_idx, _seconds(time_s)).cpu().numpy()),
+        model.intrinsics(video_idx).cpu().numpy().astype(np.float64),
+        error,
+    )
+
+
+def surface_colour(model: Animatable, rig: Rig, video_idx: int) -> np.ndarray:
+    """(V, 3) sRGB in 0..1: mean over the light of three moments of a video."""
+    points = _points(rig.mesh.vertices)
+    moments = [model.colour(points, video_idx, time).cpu().numpy() for time in (-0.5, 0.0, 0.5)]
+    return np.clip(np.mean(moments, axis=0, dtype=np.float64), 0, 1)
+
+
+def _bone_motion(model: Animatable, video_idx: int, time_s: np.ndarray) -> np.ndarray:
+    return model.bone_transforms(video_idx, _seconds(time_s)).cpu().numpy().astype(np.float64)
+
+
+def _points(vertices: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(vertices, np.float32))
+
+
+def _seconds(time_s: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(time_s, np.float64))
