@@ -1,0 +1,149 @@
+"""features: a 16-D vector a pixel, alike where the same surface is seen, on a square crop round the object.
+
+Who answers, first to last: `clip.features.npy` beside the video, the ONNX network that the settings name, the built-in
+appearance descriptor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Video, stage
+from stages.formats import (
+    FEATURE_CHANNELS,
+    FEATURE_SIZE,
+    Clip,
+    FormatError,
+    read_clip,
+    read_features,
+    read_grey,
+    read_mask_facts,
+    write_image,
+    write_json,
+)
+from stages.networks import FeatureNetwork
+from stages.perception.descriptors import crop_box, crop_resize, describe_appearance, match_trust, normalise
+from stages.perception.sheets import feature_sheet
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Settings of the `features` stage."""
+
+    network: InputFile = InputFile("")
+    """An ONNX file that turns a 1x3xHxW crop into 1x16xhxw (or 1x17xhxw, mask logit first); empty for none."""
+    network_contract: InputFile = InputFile("")
+    """A small TOML file that says what that network expects; empty for sane defaults."""
+    category: str = "other"
+    """What the network knows: written down for the stages that follow."""
+    seed: int = 0
+    """Seed of the sampling behind the trust figure."""
+
+
+@stage(per=Video, version=1, given=(".features.npy",), needs=Resources(cpus=1))
+def features(frames: Folder, masks: Folder, given: Given, settings: FeatureSettings, out: Path, run: Run) -> None:
+    """`features.npy` float16 (T, 112, 112, 16), unit length on the object and zero off it; `features.json` with crops."""
+    cv2.setNumThreads(1)
+    clip = read_clip(frames.path)
+    boxes = read_mask_facts(masks.path).box
+    crops = np.stack([crop_box(box, clip.width, clip.height) for box in boxes])
+    path = given.get(".features.npy")
+    if path is not None:
+        provider = "given"
+        values = _given(path, clip, crops)
+    else:
+        network = None
+        if settings.network:
+            network = FeatureNetwork(
+                Path(settings.network), settings.network_contract, device=run.device, threads=run.threads
+            )
+            run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
+        provider = network.path.name if network else "builtin-appearance"
+        values = np.zeros((len(clip), FEATURE_SIZE, FEATURE_SIZE, FEATURE_CHANNELS), np.float16)
+        for i in run.progress(range(len(clip)), label="features"):
+            image = crop_resize(clip.image(i), crops[i], FEATURE_SIZE if network is None else 2 * FEATURE_SIZE)
+            mask = _crop_mask(masks, clip, i, crops[i])
+            if network is None:
+                values[i] = describe_appearance(image, mask)
+            else:
+                values[i] = normalise(network(image, FEATURE_SIZE), mask > 0.5)
+    np.save(out / "features.npy", values, allow_pickle=False)
+    trust = match_trust(values, np.random.default_rng(settings.seed))
+    rows = [{"name": n, "crop": [round(float(v), 3) for v in c]} for n, c in zip(clip.names, crops, strict=True)]
+    write_json(
+        out / "features.json",
+        {
+            "network": provider,
+            "category": settings.category,
+            "margin": round(trust, 4),
+            "trust": round(trust, 4),
+            "frames": rows,
+        },
+    )
+    run.metric("network", provider)
+    run.metric("match_trust", round(trust, 3))
+
+
+def _crop_mask(masks: Folder, clip: Clip, frame_idx: int, crop: np.ndarray) -> np.ndarray:
+    """(112, 112) float32 foreground probability on the crop."""
+    grey = read_grey(masks / clip.names[frame_idx]).astype(np.float32) / 255.0
+    return crop_resize(grey, crop)
+
+
+def _given(path: Path, clip: Clip, crops: np.ndarray) -> np.ndarray:
+    """Features from the user's array: (N or T, H, W, 16) over the whole picture, or (N or T, 112, 112, 16) on our crops."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise BadInput(f"{path.name} cannot be read as a NumPy array ({error})") from error
+    source = len(clip.source_time_s)
+    shape = "x".join(str(n) for n in array.shape)
+    if array.ndim != 4 or array.shape[3] != FEATURE_CHANNELS or array.dtype.kind != "f":
+        raise BadInput(f"{path.name} holds {array.dtype} {shape}, floats of frames x height x width x 16 expected")
+    if len(array) not in (source, len(clip)):
+        raise BadInput(f"{path.name} holds {len(array)} frames, the video has {source}")
+    rows = clip.source_idx if len(array) == source else np.arange(len(clip))
+    height, width = array.shape[1:3]
+    on_crop = height == width == FEATURE_SIZE
+    if not on_crop and abs(width / height / (clip.width / clip.height) - 1) > 0.02:
+        raise BadInput(f"{path.name} is {width}x{height}, neither 112x112 nor the shape of the frames")
+    out = np.zeros((len(clip), FEATURE_SIZE, FEATURE_SIZE, FEATURE_CHANNELS), np.float16)
+    for i, row in enumerate(rows):
+        values = np.asarray(array[row], np.float32)
+        if not np.isfinite(values).all():
+            raise BadInput(f"{path.name}: frame {int(row)} holds values that are not finite")
+        if not on_crop:
+            # Pixels of the array against pixels of the frames.
+            scale = np.array([width / clip.width, height / clip.height] * 2)
+            halves = [
+                crop_resize(np.ascontiguousarray(values[..., c : c + 4]), crops[i] * scale) for c in range(0, 16, 4)
+            ]
+            values = np.concatenate(halves, axis=-1)
+        out[i] = normalise(values, np.abs(values).max(axis=-1) > 1e-6)
+    if not out.any():
+        raise BadInput(f"{path.name} holds nothing but zeros")
+    return out
+
+
+@features.check
+def _check(out: Path, frames: Folder) -> None:
+    values, crops = read_features(out)
+    clip = read_clip(frames.path)
+    if len(values) != len(clip):
+        raise FormatError(f"features.npy holds {len(values)} frames, frames.json {len(clip)}")
+    side = crops[:, 2:] - crops[:, :2]
+    if not np.isfinite(crops).all() or (np.abs(side[:, 0] - side[:, 1]) > 0.01).any() or (side <= 0).any():
+        raise FormatError("features.json: crops must be squares")
+    for i, frame in enumerate(values):
+        length = np.linalg.norm(frame.astype(np.float32), axis=-1)
+        if not np.isfinite(length).all() or (np.abs(length[length > 0] - 1) > 0.02).any():
+            raise FormatError(f"features.npy: frame {i} is neither of unit length nor zero")
+
+
+@features.sheet
+def _sheet(out: Path, picture: Path) -> None:
+    write_image(picture, feature_sheet(read_features(out)[0]))

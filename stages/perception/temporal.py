@@ -1,0 +1,88 @@
+"""Masks through time: boxes, areas, what is missing, cut off or jumps, and how far each frame may be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+MISSING_AREA = 5e-4
+"""A mask smaller than this fraction of the image counts as missing."""
+JUMP_IOU = 0.35
+"""Overlap with the neighbour, brought here by flow, below which a mask counts as jumped."""
+
+
+@dataclass(frozen=True)
+class MaskTrack:
+    """What can be said of (T, H, W) masks without knowing the truth."""
+
+    box: np.ndarray  # (T, 4) float x0, y0, x1, y1 in pixels, zeros where missing
+    area: np.ndarray  # (T,) float, fraction of the image
+    overlap: np.ndarray  # (T,) float in 0..1: best overlap with a neighbour brought here by flow
+    flags: list[list[str]]  # a frame: subset of "missing", "border", "jumped"
+
+
+def mask_box(mask: np.ndarray) -> np.ndarray:
+    """(4,) x0, y0, x1, y1 of a boolean (H, W) mask, pixel edges; zeros if empty."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return np.zeros(4)
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], float)
+
+
+def touches_border(mask: np.ndarray, share: float = 0.03) -> bool:
+    """Whether more than `share` of the mask's own extent (square root of its area) lies on the image's border."""
+    on_border = mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum()
+    return bool(on_border > max(2.0, share * np.sqrt(mask.sum()) * 4))
+
+
+def intersection_over_union(a: np.ndarray, b: np.ndarray) -> float:
+    """Overlap of two boolean masks; 1 if both are empty."""
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 1.0
+
+
+def describe(masks: np.ndarray, previous: list[np.ndarray | None]) -> MaskTrack:
+    """Boxes, areas, neighbour overlap and flags of boolean (T, H, W) masks.
+
+    `previous[t]` is the mask of frame t-1 brought to frame t by flow, None for the first.
+    """
+    count = len(masks)
+    area = masks.reshape(count, -1).mean(axis=1)
+    steps = [1.0 if p is None else intersection_over_union(m, p) for m, p in zip(masks, previous, strict=True)]
+    if count > 1:
+        steps[0] = steps[1]
+    after = [*steps[1:], steps[-1]]
+    overlap = np.maximum(steps, after)
+    flags: list[list[str]] = []
+    for t in range(count):
+        row = []
+        if area[t] < MISSING_AREA:
+            row.append("missing")
+        else:
+            if touches_border(masks[t]):
+                row.append("border")
+            if overlap[t] < JUMP_IOU:
+                row.append("jumped")
+        flags.append(row)
+    box = np.stack([mask_box(m) if area[t] >= MISSING_AREA else np.zeros(4) for t, m in enumerate(masks)])
+    return MaskTrack(box, area, np.asarray(overlap), flags)
+
+
+def main_component(mask: np.ndarray, anchor: np.ndarray | None = None, keep_share: float = 0.12) -> np.ndarray:
+    """The largest component of a boolean mask and those at least `keep_share` of it; holes of up to 1 % are filled.
+
+    With `anchor` (H, W) float weights, components are ranked by area times mean anchor instead of area.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    if count <= 1:
+        return mask
+    sizes = stats[1:, cv2.CC_STAT_AREA].astype(float)
+    if anchor is not None:
+        sizes = np.bincount(labels.ravel(), weights=anchor.ravel(), minlength=count)[1:]
+    kept = np.flatnonzero(sizes >= keep_share * sizes.max()) + 1
+    out = np.isin(labels, kept)
+    holes, hole_labels, hole_stats, _ = cv2.connectedComponentsWithStats((~out).astype(np.uint8), connectivity=4)
+    small = np.flatnonzero(hole_stats[1:, cv2.CC_STAT_AREA] < 0.01 * out.sum()) + 1
+    return out | np.isin(hole_labels, small) if holes > 1 else out
