@@ -126,7 +126,9 @@ def _shake(rng: np.random.Generator, times_s: np.ndarray, channels: int) -> np.n
 def write_video(path: Path, images: np.ndarray, fps: int, crf: int = 18, lossless: bool = False) -> None:
     """Write (T, H, W, 3) or (T, H, W) uint8 as H.264 in the container the suffix names; even sizes only."""
     with av.open(str(path), "w") as container:
-        options = {"qp": "0", "preset": "veryfast"} if lossless else {"crf": str(crf), "preset": "veryfast"}
+        options = {"qp": "0"} if lossless else {"crf": str(crf)}
+        # Without macroblock trees x264 writes the same bytes every time; with them its AVX-512 code does not.
+        options |= {"preset": "veryfast", "x264-params": "mbtree=0"}
         stream = container.add_stream("libx264", rate=Fraction(fps), options={**options, "threads": "1"})
         stream.height, stream.width, stream.pix_fmt = images.shape[1], images.shape[2], "yuv420p"
         for image in images:

@@ -61,42 +61,46 @@ def draw_room(room: Room, room_from_camera: np.ndarray, intrinsics: np.ndarray, 
 
     `shadow` darkens the floor: an image (n, n) of 0..1, the (x, z) of its centre and half its side in room units.
     """
-    rows, columns = np.mgrid[0:height_px, 0:width_px].astype(np.float32)
-    rays = np.stack(
-        [
-            (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0],
-            (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1],
-            np.ones_like(rows),
-        ],
-        -1,
-    ) @ room_from_camera[:3, :3].T.astype(np.float32)
-    eye = room_from_camera[:3, 3].astype(np.float32)
+    fx, fy, cx, cy = (float(intrinsics[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    across = ((np.arange(width_px) + 0.5 - cx) / fx).astype(np.float32)[None]
+    down = ((np.arange(height_px) + 0.5 - cy) / fy).astype(np.float32)[:, None]
+    length = np.sqrt(1 + across**2 + down**2)
+    rotation, eye = room_from_camera[:3, :3], room_from_camera[:3, 3]
+
+    def along(direction: np.ndarray) -> np.ndarray:
+        """Dot product of every pixel's ray (unit depth) with a direction of the room, (H, W) float32."""
+        a, b, c = (float(v) for v in direction @ rotation)
+        return a * across + (b * down + c)
+
     nearest = np.full((height_px, width_px), np.inf, np.float32)
     image = np.zeros((height_px, width_px, 3), np.float32)
     for surface in room.surfaces:
-        normal = np.cross(surface.edge_u, surface.edge_v).astype(np.float32)
-        facing = rays @ normal
+        normal = np.cross(surface.edge_u, surface.edge_v)
+        normal = normal / np.linalg.norm(normal)
+        facing = along(normal)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = float((surface.origin - eye) @ normal) / facing
-        hit = (depth > 1e-3) & (depth < nearest)
+        axis_u = surface.edge_u / float(surface.edge_u @ surface.edge_u)
+        axis_v = surface.edge_v / float(surface.edge_v @ surface.edge_v)
+        with np.errstate(invalid="ignore", over="ignore"):
+            u = depth * along(axis_u) + float((eye - surface.origin) @ axis_u)
+            v = depth * along(axis_v) + float((eye - surface.origin) @ axis_v)
+            hit = (depth > 1e-3) & (depth < nearest) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
         if not hit.any():
             continue
         y0, y1 = np.flatnonzero(hit.any(1))[[0, -1]]
         x0, x1 = np.flatnonzero(hit.any(0))[[0, -1]]
         window = (slice(y0, y1 + 1), slice(x0, x1 + 1))
-        z, seen = depth[window], hit[window]
-        offset = eye + rays[window] * np.where(seen, z, 0)[..., None] - surface.origin.astype(np.float32)
-        u = offset @ (surface.edge_u / (surface.edge_u @ surface.edge_u)).astype(np.float32)
-        v = offset @ (surface.edge_v / (surface.edge_v @ surface.edge_v)).astype(np.float32)
-        seen = seen & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-        if not seen.any():
-            continue
-        cosine = np.abs(facing[window]) / (np.linalg.norm(normal) * np.linalg.norm(rays[window], axis=-1))
-        colour = _sample(surface, u, v, z / intrinsics[0, 0] / np.sqrt(np.maximum(cosine, 0.05)))
+        seen = hit[window]
+        z, u, v = (np.where(seen, value[window], np.float32(0)) for value in (depth, u, v))
+        slant = np.sqrt(np.maximum(np.abs(facing[window]) / length[window], np.float32(0.05)))
+        colour = _sample(surface, u, v, z / (fx * slant), seen)
         if surface.floor and shadow is not None:
-            colour = colour * _shadow_factor(offset + surface.origin.astype(np.float32), *shadow)
-        image[window][seen] = colour[seen]
-        nearest[window][seen] = z[seen]
+            x = u * float(surface.edge_u[0]) + v * float(surface.edge_v[0]) + float(surface.origin[0])
+            y = u * float(surface.edge_u[2]) + v * float(surface.edge_v[2]) + float(surface.origin[2])
+            colour = colour * _shadow_factor(x, y, *shadow)
+        np.copyto(image[window], colour, where=seen[..., None])
+        np.copyto(nearest[window], z, where=seen)
     return image
 
 
@@ -121,11 +125,11 @@ def _splat(grid: np.ndarray, value: np.ndarray, size_px: int) -> np.ndarray:
     return image
 
 
-def _shadow_factor(points: np.ndarray, shadow: np.ndarray, centre: np.ndarray, half: float) -> np.ndarray:
-    size = shadow.shape[0]
-    x = ((points[..., 0] - centre[0] + half) / (2 * half) * size - 0.5).astype(np.float32)
-    z = ((points[..., 2] - centre[1] + half) / (2 * half) * size - 0.5).astype(np.float32)
-    return 1.0 - cv2.remap(shadow, x, z, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[..., None]
+def _shadow_factor(x: np.ndarray, z: np.ndarray, shadow: np.ndarray, centre: np.ndarray, half: float) -> np.ndarray:
+    texel = shadow.shape[0] / (2 * half)
+    column = ((x - float(centre[0]) + half) * texel - 0.5).astype(np.float32)
+    row = ((z - float(centre[1]) + half) * texel - 0.5).astype(np.float32)
+    return 1.0 - cv2.remap(shadow, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[..., None]
 
 
 def _surface(origin: tuple, edge_u: tuple, edge_v: tuple, texture: np.ndarray, floor: bool = False) -> Surface:
@@ -135,17 +139,20 @@ def _surface(origin: tuple, edge_u: tuple, edge_v: tuple, texture: np.ndarray, f
     return Surface(np.array(origin, float), np.array(edge_u, float), np.array(edge_v, float), tuple(pyramid), floor)
 
 
-def _sample(surface: Surface, u: np.ndarray, v: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+def _sample(surface: Surface, u: np.ndarray, v: np.ndarray, footprint: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Texture colours at (u, v), from the pyramid level whose texels are about as large as the pixel's footprint."""
-    texel = np.linalg.norm(surface.edge_u) / surface.pyramid[0].shape[1]
-    level = np.clip(np.round(np.log2(np.maximum(footprint / texel, 1e-3))), 0, len(surface.pyramid) - 1).astype(int)
+    texel = float(np.linalg.norm(surface.edge_u)) / surface.pyramid[0].shape[1]
+    top = len(surface.pyramid) - 1
+    level = np.clip(np.log2(np.maximum(footprint / texel, 0.5)) + 0.5, 0, top).astype(np.int8)
     out = np.zeros((*u.shape, 3), np.float32)
-    for k in np.unique(level):
+    for k in np.flatnonzero(np.bincount(level[seen], minlength=top + 1)):
         texture = surface.pyramid[k]
-        x = (u * texture.shape[1] - 0.5).astype(np.float32)
-        y = (v * texture.shape[0] - 0.5).astype(np.float32)
         chosen = level == k
-        out[chosen] = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[chosen]
+        rows = np.flatnonzero(chosen.any(1))
+        part = slice(rows[0], rows[-1] + 1)
+        x, y = u[part] * texture.shape[1] - 0.5, v[part] * texture.shape[0] - 0.5
+        colour = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        np.copyto(out[part], colour, where=chosen[part][..., None])
     return out
 
 
