@@ -34,8 +34,9 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], time_s: np.ndarray, 
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
                 stream.time_base = stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
-                # One thread: with several, the bytes would depend on the machine.
-                stream.options = {"crf": str(crf), "preset": "veryfast", "threads": "1"}
+                # One thread: with several, the bytes would depend on the machine. No macroblock trees: x264's AVX-512
+                # code for them reads memory it never wrote, and now and then the bytes differ.
+                stream.options = {"crf": str(crf), "preset": "veryfast", "threads": "1", "x264-params": "mbtree=0"}
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             frame.pts, frame.time_base = int(tick), Fraction(1, _TICKS_PER_S)
             container.mux(stream.encode(frame))
