@@ -1,0 +1,93 @@
+"""What a run shows on a terminal: a live table, or plain lines when nobody watches."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, TextIO
+
+from pipeline.plan import HIT, WAIT, Step
+from pipeline.reasons import brief
+
+
+def duration(seconds: float) -> str:
+    """``4.2 s``, ``1:05 min``, ``2 h 41 min``."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
+    return f"{int(seconds) // 3600} h {int(seconds) % 3600 // 60} min"
+
+
+def size(count: float) -> str:
+    """Bytes for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" or count >= 100 else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} TB"
+
+
+def print_plan(steps: list[Step], stream: TextIO | None = None) -> None:
+    """One line a node that is not up to date."""
+    stream = stream or sys.stdout
+    pending = [s for s in steps if s.status != HIT]
+    width = max((len(s.node.label) for s in pending), default=0)
+    for step in pending:
+        past = f"  took {duration(step.record.seconds)} last time" if step.record else ""
+        if step.status == WAIT:
+            what = f"waits for {', '.join(step.waits_for[:2])}{' …' if len(step.waits_for) > 2 else ''}"
+        else:
+            what = brief(step.reasons)
+        stream.write(f"  {step.node.label:<{width}}  {what}{past}\n")
+
+
+class PlainDisplay:
+    """Lines for logs and pipes."""
+
+    def __init__(self, stream: TextIO, interval_s: float = 15.0) -> None:
+        self._stream, self._interval_s = stream, interval_s
+        self._told: dict[str, float] = {}
+
+    def event(self, label: str, event: dict[str, Any]) -> None:
+        """Write a line for what matters."""
+        kind, text = event.get("event"), event.get("text", "")
+        if kind == "launched":
+            self._line(f"{label}: running")
+            self._told[label] = time.monotonic()
+        elif kind == "progress":
+            now = time.monotonic()
+            if now - self._told.get(label, 0.0) >= self._interval_s:
+                self._told[label] = now
+                self._line(f"{label}: {progress_text(event)}")
+        elif kind == "warning":
+            self._line(f"{label}: warning: {text}")
+        elif kind == "done":
+            self._line(f"{label}: done in {duration(event['seconds'])}")
+        elif kind in ("failed", "bad_input"):
+            self._line(f"{label}: failed: {text}")
+        elif kind == "interrupted":
+            self._line(f"{label}: stopped ({text}); it resumes from its checkpoint")
+        elif kind == "waiting":
+            self._line(f"{label}: {text}; waiting")
+        elif kind == "stopping":
+            self._line("stopping: workers save their work; once more to kill them")
+
+    def refresh(self) -> None:
+        """Nothing to redraw."""
+
+    def _line(self, text: str) -> None:
+        self._stream.write(f"{time.strftime('%H:%M:%S')}  {text}\n")
+        self._stream.flush()
+
+
+def progress_text(event: dict[str, Any]) -> str:
+    """``143/212  loss 0.31``."""
+    total = event.get("total")
+    done = event.get("done", 0)
+    text = f"{done:g}/{total:g}" if isinstance(total, int | float) else f"{done:g}"
+    if event.get("label"):
+        text = f"{event['label']} {text}"
+    extra = event.get("extra") or {}
+    words = [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in extra.items()]
+    return "  ".join([text, *words])

@@ -1,0 +1,57 @@
+"""Progress and decisions as JSON lines: workers append to their own file, the run copies them into its own."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+
+class EventWriter:
+    """Appends events to a file, one line each, in one write. Losing an event never stops the work."""
+
+    def __init__(self, path: Path, common: dict[str, Any] | None = None) -> None:
+        self._common = common or {}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = open(path, "ab", buffering=0)  # noqa: SIM115  (lives as long as the process)
+
+    def __call__(self, event: dict[str, Any]) -> None:
+        """Append one event."""
+        value = {"time": round(time.time(), 3), **self._common, **event}
+        try:
+            self._file.write((json.dumps(value, ensure_ascii=True) + "\n").encode())
+        except (OSError, ValueError, TypeError):
+            pass
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class EventReader:
+    """Reads whole new lines of a growing file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+
+    def read(self) -> list[dict[str, Any]]:
+        """The events appended since the last call; lines that are not JSON are skipped."""
+        try:
+            with open(self._path, "rb") as file:
+                file.seek(self._offset)
+                data = file.read()
+        except OSError:
+            return []
+        whole = data[: data.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        found = []
+        for line in whole.splitlines():
+            try:
+                value = json.loads(line)
+            except (ValueError, RecursionError):
+                continue
+            if isinstance(value, dict):
+                found.append(value)
+        return found

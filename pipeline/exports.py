@@ -1,0 +1,88 @@
+"""Real copies of the last stage's files in ``exports/``, swapped in whole; the user's own files there are kept."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import BadInput
+from pipeline.files import read_json, remove_tree, unique, write_json
+from pipeline.ledger import Record
+from pipeline.objects import walk
+from pipeline.plan import Planner, Step
+from pipeline.project import Project
+
+PROVENANCE = "provenance.json"
+
+
+def export(project: Project, steps: list[Step], planner: Planner | None = None) -> Path | None:
+    """Copy the last stage's folder to ``exports/`` unless it is there already; None when there is none."""
+    last = list(project.definition.stages)[-1]
+    results = planner.results if planner else {s.node.label: s.record for s in steps if s.record}
+    records = {s.node.video_name: results[s.node.label] for s in steps if s.node.info.name == last}
+    if not records:
+        return None
+    target = project.workspace.exports
+    wanted = {video or "": record.digest for video, record in records.items()}
+    before = read_json(target / PROVENANCE)
+    before = before if isinstance(before, dict) else {}
+    if before.get("digests") == wanted and _complete(target, before.get("files", {})):
+        return target
+    fresh = project.workspace.tmp / f"export-{unique()}"
+    for video, record in records.items():
+        if not project.workspace.objects.sound(record.stage, record.digest):
+            raise BadInput(f"the result of {record.label} is damaged", hint="run again")
+        _copy(project.workspace.objects.path(record.stage, record.digest), fresh / video if video else fresh)
+    files = {name: [s.st_size, s.st_mtime_ns] for name, _, s in walk(fresh)}
+    write_json(fresh / PROVENANCE, _provenance(project, wanted, files, results))
+    _keep_foreign(target, fresh, before.get("files", {}))
+    retired = project.workspace.tmp / f"retired-{unique()}"
+    if target.exists():
+        os.rename(target, retired)
+    os.rename(fresh, target)
+    remove_tree(retired)
+    return target
+
+
+def _copy(source: Path, target: Path) -> None:
+    for name, path, _ in walk(source):
+        place = target / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, place)
+
+
+def _complete(target: Path, files: dict[str, Any]) -> bool:
+    try:
+        return all((target / name).stat().st_size == facts[0] for name, facts in files.items())
+    except (OSError, TypeError, IndexError):
+        return False
+
+
+def _keep_foreign(target: Path, fresh: Path, ours: dict[str, Any]) -> None:
+    """Carry over files that we did not put there, or that were edited since, into the fresh folder."""
+    if not target.is_dir() or target.is_symlink():
+        return
+    stamp = time.strftime("%Y-%m-%dT%H-%M-%S")
+    for name, path, status in walk(target):
+        if name == PROVENANCE or ours.get(name) == [status.st_size, status.st_mtime_ns]:
+            continue
+        edited = name in ours or (fresh / name).exists()
+        place = fresh / f"kept-{stamp}" / name if edited else fresh / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, place, follow_symlinks=False)
+
+
+def _provenance(
+    project: Project, wanted: dict[str, str], files: dict[str, Any], results: dict[str, Record]
+) -> dict[str, Any]:
+    return {
+        "digests": wanted,
+        "videos": {v.name: {"file": v.display, "sha256": project.sources.of(v.path)} for v in project.videos},
+        "preset": project.settings.preset,
+        "actions": {label: record.key for label, record in results.items()},
+        "settings": {s: v for s, v in project.settings.values.items() if s in project.definition.stages},
+        "files": files,
+    }

@@ -1,0 +1,115 @@
+"""Small file operations that the store is built from: atomic writes, tree removal, failpoints, file signatures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+CHUNK = 1 << 20
+
+
+def failpoint(name: str) -> None:
+    """Die here, as from a power cut, if the environment asks for it (tests only)."""
+    if os.environ.get("BANMO_FAILPOINT") == name:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def unique() -> str:
+    """A short name that no other attempt has."""
+    return time.strftime("%Y%m%dT%H%M%S", time.gmtime()) + "-" + secrets.token_hex(4)
+
+
+def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write a text file so that readers see the old or the new content, never a part of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name[:80]}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(temporary, "w", encoding="utf-8") as file:
+            file.write(text)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if durable:
+        sync_folder(path.parent)
+
+
+def sync_folder(path: Path) -> None:
+    """Make the entries of a folder durable, where the file system allows it."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+def read_json(path: Path) -> Any:
+    """Parsed JSON, or None when the file is missing, torn or not JSON."""
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
+    """Write JSON atomically; NaN is refused."""
+    write_atomic(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", durable=durable)
+
+
+def sha256_file(path: Path) -> str:
+    """SHA-256 of a file's content."""
+    digest = hashlib.sha256()
+    with open(path, "rb", buffering=0) as file:
+        while chunk := file.read(CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def signature(status: os.stat_result) -> list[int]:
+    """What changes whenever a file's content does: (inode, size, mtime, ctime)."""
+    return [status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns]
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a file or folder of ours, read-only or not; missing is fine. Links are removed, never followed."""
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISDIR(status.st_mode):
+        path.unlink(missing_ok=True)
+        return
+    for folder, _, _ in os.walk(path):
+        try:
+            os.chmod(folder, 0o755)
+        except OSError:
+            pass
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def relink(link: Path, target: str) -> None:
+    """Point a symbolic link at `target`, atomically; a small ``.path`` file where links are not supported."""
+    temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}.tmp")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.symlink(target, temporary)
+        os.replace(temporary, link)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        write_atomic(link.with_name(link.name + ".path"), target + "\n")

@@ -1,0 +1,114 @@
+"""The records of finished actions: ``actions/<stage>/<key>.json``.
+
+A record keeps the action's text, the folder it gave, the hash of every code file, metrics, warnings, time, host and
+versions. It is written after the folder it names. A record that cannot be parsed, or whose text does not hash to its
+own name, is no record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.action import key_of
+from pipeline.files import failpoint, read_json, write_json
+
+FORMAT = 1
+
+
+@dataclass
+class Record:
+    """One finished action."""
+
+    key: str
+    stage: str
+    video: str | None
+    action: dict[str, Any]
+    modules: dict[str, str]
+    digest: str
+    files: int
+    bytes: int
+    seconds: float
+    started: str
+    finished: str
+    run: str
+    metrics: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    host: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    blessed: dict[str, Any] | None = None
+    format: int = FORMAT
+
+    @property
+    def label(self) -> str:
+        """``stage/video`` or ``stage``."""
+        return f"{self.stage}/{self.video}" if self.video else self.stage
+
+
+class Ledger:
+    """Reads and writes records."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._cache: dict[str, list[Record]] = {}
+
+    def path(self, stage: str, key: str) -> Path:
+        """Where the record of this key lies."""
+        return self.root / stage / f"{key}.json"
+
+    def find(self, stage: str, key: str) -> Record | None:
+        """The record of this key, or None."""
+        return parse(read_json(self.path(stage, key)), stage, key)
+
+    def write(self, record: Record) -> None:
+        """Write a record durably, replacing an earlier one of the same key."""
+        failpoint("before_record")
+        write_json(self.path(record.stage, record.key), asdict(record), durable=True)
+        self._cache.pop(record.stage, None)
+        failpoint("after_record")
+
+    def all(self, stage: str) -> list[Record]:
+        """Every valid record of a stage, newest first. Read once; `refresh` forgets."""
+        if stage not in self._cache:
+            folder = self.root / stage
+            names = sorted(p.stem for p in folder.glob("*.json")) if folder.is_dir() else []
+            records = [r for key in names if (r := self.find(stage, key)) is not None]
+            self._cache[stage] = sorted(records, key=lambda r: r.finished, reverse=True)
+        return self._cache[stage]
+
+    def stages(self) -> list[str]:
+        """Names of the stages that have records."""
+        return sorted(p.name for p in self.root.iterdir() if p.is_dir()) if self.root.is_dir() else []
+
+    def refresh(self) -> None:
+        """Forget what was read, because another process may have written."""
+        self._cache.clear()
+
+
+def parse(value: Any, stage: str, key: str) -> Record | None:
+    """A record from parsed JSON, or None when it is not one of this stage and key."""
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        return None
+    try:
+        record = Record(**value)
+        if not (isinstance(record.action, dict) and key_of(record.action) == key == record.key):
+            return None
+    except (TypeError, ValueError, RecursionError):
+        return None
+    right = (
+        record.stage == stage == record.action.get("stage")
+        and isinstance(record.video, str | None)
+        and _is_digest(record.digest)
+        and all(isinstance(v, int) for v in (record.files, record.bytes))
+        and isinstance(record.seconds, int | float)
+        and all(isinstance(v, str) for v in (record.started, record.finished, record.run, record.host))
+        and isinstance(record.modules, dict)
+        and isinstance(record.metrics, dict)
+        and isinstance(record.warnings, list)
+    )
+    return record if right else None
+
+
+def _is_digest(value: Any) -> bool:
+    return isinstance(value, str) and len(value) == 64 and not set(value) - set("0123456789abcdef")

@@ -1,0 +1,178 @@
+"""What has to run: for every node a hit in the ledger, a run with its reasons, or a wait for another node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.action import Action, action
+from pipeline.graph import Graph, Node
+from pipeline.ledger import Record
+from pipeline.reasons import Reason, compare, nearest
+from pipeline.settings import Settings, stage_values
+from pipeline.videos import SourceDigests
+from pipeline.workspace import Workspace
+
+HIT, RUN, WAIT = "hit", "run", "wait"
+
+
+@dataclass
+class Step:
+    """The decision about one node. `record` is the hit, or the nearest earlier result for times and reasons."""
+
+    node: Node
+    status: str
+    action: Action | None = None
+    record: Record | None = None
+    reasons: list[Reason] = field(default_factory=list)
+    waits_for: list[str] = field(default_factory=list)
+
+
+class Planner:
+    """Decides node by node, in order; told of each result, it can decide the nodes that waited for it."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        graph: Graph,
+        settings: Settings,
+        sources: SourceDigests,
+        forced: set[Node] | None = None,
+    ) -> None:
+        self.workspace, self.graph, self.settings, self.sources = workspace, graph, settings, sources
+        self.forced = set(forced or ())
+        self.results: dict[str, Record] = {}
+        """Label -> the record that stands for this node now."""
+        self.steps: dict[str, Step] = {}
+
+    def plan(self, nodes: list[Node]) -> list[Step]:
+        """Decide every node as far as it can be decided now."""
+        return [self.decide(node) for node in nodes]
+
+    def decide(self, node: Node) -> Step:
+        """Decide one node; its inputs must have been decided before."""
+        waits = self._missing(node)
+        if waits:
+            step = Step(node, WAIT, waits_for=waits)
+            step.reasons, step.record = self._expected(node)
+        else:
+            wanted = self.action(node)
+            record = self.workspace.ledger.find(node.info.name, wanted.key)
+            if record is None:
+                record, reasons = self._reasons(node, wanted)
+                step = Step(node, RUN, wanted, record, reasons)
+            elif not self.workspace.objects.sound(node.info.name, record.digest):
+                step = Step(node, RUN, wanted, record, [Reason("damaged", f"objects/{node.info.name}/{record.digest}")])
+            elif node in self.forced:
+                step = Step(node, RUN, wanted, record, [Reason("asked for")])
+            else:
+                step = Step(node, HIT, wanted, record)
+                self.results[node.label] = record
+        self.steps[node.label] = step
+        return step
+
+    def finished(self, node: Node, record: Record) -> None:
+        """Tell the planner that a node now has this result."""
+        self.results[node.label] = record
+        self.forced.discard(node)
+
+    # ------------------------------------------------------------------ actions
+
+    def action(self, node: Node) -> Action:
+        """The action of a node whose inputs are known."""
+        info = node.info
+        assert info.code is not None
+        return action(
+            stage=info.name,
+            version=info.version,
+            code=info.code.digest,
+            settings=self._settings_for_key(node),
+            inputs=self._inputs(node, {}),
+            salt=self.settings.pipeline.salt,
+        )
+
+    def _settings_for_key(self, node: Node) -> dict[str, Any]:
+        kinds = {f["name"]: f["type"] for f in node.info.fields}
+        values = stage_values(self.settings, node.info)
+        return {key: self._by_content(kinds[key], value) for key, value in values.items()}
+
+    def _by_content(self, kind: dict[str, Any], value: Any) -> Any:
+        """A setting with the paths of files replaced by the digests of their content."""
+        if value is None or value == "":
+            return value
+        if kind["kind"] == "file":
+            return {"file": self.sources.of(Path(value))}
+        if kind["kind"] == "optional":
+            return self._by_content(kind["item"], value)
+        if kind["kind"] == "list":
+            return [self._by_content(kind["item"], v) for v in value]
+        if kind["kind"] == "tuple":
+            return [self._by_content(k, v) for k, v in zip(kind["items"], value, strict=True)]
+        return value
+
+    def _inputs(self, node: Node, missing: dict[str, Any]) -> dict[str, Any]:
+        """Digests of everything the node reads. `missing` stands in for nodes without a result."""
+        found: dict[str, Any] = {}
+        for name, nodes in self.graph.inputs(node).items():
+            digests = {}
+            for source in nodes:
+                record = self.results.get(source.label)
+                digests[source.video_name or ""] = record.digest if record else missing.get(source.label)
+            by_video = node.video is None and bool(nodes) and nodes[0].video is not None
+            found[name] = digests if by_video else next(iter(digests.values()))
+        videos = [node.video] if node.video else self.graph.videos
+        if "video" in node.info.takes:
+            digests = {v.name: self.sources.of(v.path) for v in videos}
+            found["video"] = digests[node.video.name] if node.video else digests
+        if "given" in node.info.takes:
+            beside = {
+                v.name: {s: self.sources.of(v.given[s]) for s in node.info.given if s in v.given} for v in videos
+            }
+            found["given"] = beside[node.video.name] if node.video else beside
+        return found
+
+    def _missing(self, node: Node) -> list[str]:
+        found = [n.label for nodes in self.graph.inputs(node).values() for n in nodes if n.label not in self.results]
+        return list(dict.fromkeys(found))
+
+    # ------------------------------------------------------------------ reasons
+
+    def _reasons(self, node: Node, wanted: Action) -> tuple[Record | None, list[Reason]]:
+        earlier = nearest(wanted.text, self.workspace.ledger.all(node.info.name), node.video_name)
+        if earlier is None:
+            return None, [Reason("never run")]
+        assert node.info.code is not None
+        reasons = compare(wanted.text, node.info.code.modules, earlier, self._because)
+        return earlier, reasons or [Reason("never run")]
+
+    def _expected(self, node: Node) -> tuple[list[Reason], Record | None]:
+        """Reasons of a node whose inputs are not known yet: those inputs stand as changed, because of their own."""
+        info = node.info
+        assert info.code is not None
+        text = action(
+            stage=info.name,
+            version=info.version,
+            code=info.code.digest,
+            settings=self._settings_for_key(node),
+            inputs=self._inputs(node, {label: f"of {label}" for label in self._missing(node)}),
+            salt=self.settings.pipeline.salt,
+        ).text
+        earlier = nearest(text, self.workspace.ledger.all(info.name), node.video_name)
+        if earlier is None:
+            return [Reason("never run")], None
+        return compare(text, info.code.modules, earlier, self._because), earlier
+
+    def _because(self, stage: str, video: str | None, new: str | None, old: str | None) -> list[Reason]:
+        """Why the folder of an input changed from digest `old` to `new`."""
+        label = f"{stage}/{video}" if video else stage
+        step = self.steps.get(label)
+        if step is None:
+            return []
+        if step.status != HIT:
+            return step.reasons
+        now = self.results.get(label)
+        before = [r for r in self.workspace.ledger.all(stage) if r.digest == old and r.video == video]
+        if now is None or not before:
+            return []
+        return compare(now.action, now.modules, before[0], self._because)

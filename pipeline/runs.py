@@ -1,0 +1,89 @@
+"""One folder a run: plan.json, settings.toml, events.jsonl, logs, and a view of links to what it looked at."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from pipeline.events import EventWriter
+from pipeline.files import read_json, relink, unique, write_atomic, write_json
+from pipeline.graph import Node
+from pipeline.workspace import Workspace
+
+
+class RunFolder:
+    """The folder of one run. Holding it holds the run's lock, by which others see that it is alive."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.id = time.strftime("%Y-%m-%dT%H-%M-%S") + "-" + unique()[-4:]
+        self.path = workspace.runs / self.id
+        self.view = self.path / "view"
+        self._lock = workspace.run_lock(self.id)
+
+    def open(self) -> None:
+        """Create the folder and take the lock."""
+        with self.workspace.exclusive():
+            self._lock.acquire()
+            self.view.mkdir(parents=True)
+        self.events = EventWriter(self.path / "events.jsonl")
+
+    def close(self) -> None:
+        """Let go of the lock."""
+        self.events.close()
+        self._lock.release()
+        (self.workspace.leases / f"run-{self.id}.lock").unlink(missing_ok=True)
+
+    def log_path(self, node: Node) -> Path:
+        """Log of one action of this run."""
+        return self.path / "logs" / f"{node.label.replace('/', '-')}.txt"
+
+    def write_plan(self, value: dict[str, Any], settings_toml: str) -> None:
+        """Keep the plan and the merged settings."""
+        write_json(self.path / "plan.json", value)
+        write_atomic(self.path / "settings.toml", settings_toml)
+
+    def link(self, node: Node, digest: str) -> None:
+        """Show a result in the view."""
+        place = view_place(self.view, node.info.name, node.video_name)
+        target = self.workspace.objects.path(node.info.name, digest)
+        relink(place, os.path.relpath(target, place.parent))
+
+    def make_latest(self) -> None:
+        """Let ``latest`` point at this run's view."""
+        relink(self.workspace.root / "latest", os.path.relpath(self.view, self.workspace.root))
+
+
+def view_place(view: Path, stage: str, video: str | None) -> Path:
+    """Where a view shows a stage's folder."""
+    return view / "videos" / video / stage if video else view / stage
+
+
+def list_runs(workspace: Workspace) -> list[str]:
+    """Ids of the runs, newest first."""
+    if not workspace.runs.is_dir():
+        return []
+    return sorted((p.name for p in workspace.runs.iterdir() if (p / "plan.json").is_file()), reverse=True)
+
+
+def read_plan(workspace: Workspace, run: str) -> dict[str, Any]:
+    """The plan of a run, empty when unreadable."""
+    value = read_json(workspace.runs / run / "plan.json")
+    return value if isinstance(value, dict) else {}
+
+
+def shows(workspace: Workspace, wanted: dict[tuple[str, str | None], str]) -> bool:
+    """Whether ``latest`` shows exactly these (stage, video) -> digest."""
+    latest = workspace.root / "latest"
+    for (stage, video), digest in wanted.items():
+        place = view_place(latest, stage, video)
+        try:
+            if os.path.basename(os.readlink(place)) != digest:
+                return False
+        except OSError:
+            return False
+    videos = latest / "videos"
+    names = {p.name for p in videos.iterdir()} if videos.is_dir() else set()
+    return names == {video for _, video in wanted if video}

@@ -1,0 +1,306 @@
+"""Runs a plan: launches what is ready, collects what ends, decides what waited; keeps going past failures."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from types import FrameType
+from typing import Any, Protocol
+
+from pipeline.files import remove_tree, write_json
+from pipeline.graph import Node
+from pipeline.local import Job, Outcome, Tokens
+from pipeline.plan import HIT, RUN, WAIT, Planner, Step
+from pipeline.runs import RunFolder
+from pipeline.settings import stage_values
+from pipeline.videos import VideoFile, state_of
+
+_POLL_S = 0.05
+
+
+class Display(Protocol):
+    """What shows a run to people."""
+
+    def event(self, label: str, event: dict[str, Any]) -> None:
+        """Something happened to the node `label`: queued, hit, started, progress, warning, done, failed, …"""
+
+    def refresh(self) -> None:
+        """Time passed."""
+
+
+@dataclass
+class Report:
+    """How a run ended."""
+
+    done: list[str] = field(default_factory=list)
+    hits: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
+    bad_input: dict[str, str] = field(default_factory=dict)
+    interrupted: list[str] = field(default_factory=list)
+    blocked: dict[str, str] = field(default_factory=dict)
+    not_started: list[str] = field(default_factory=list)
+    warnings: dict[str, list[str]] = field(default_factory=dict)
+    stopped_by: int | None = None
+    seconds: float = 0.0
+
+
+class Scheduler:
+    """One run over the nodes of a plan."""
+
+    def __init__(
+        self,
+        planner: Planner,
+        steps: list[Step],
+        folder: RunFolder,
+        tokens: Tokens,
+        display: Display,
+        *,
+        fail_fast: bool = False,
+        on_result: Callable[[Node], None] | None = None,
+    ) -> None:
+        self.planner, self.folder, self.tokens, self.display = planner, folder, tokens, display
+        self.fail_fast = fail_fast
+        self.on_result = on_result
+        self.workspace = planner.workspace
+        self.report = Report()
+        self._steps = {s.node.label: s for s in steps}
+        self._waiting = [s.node for s in steps if s.status == WAIT]
+        self._ready = [s.node for s in steps if s.status == RUN]
+        self._jobs: dict[Node, Job] = {}
+        self._signals = 0
+        self._grace_s = planner.settings.execution.grace_s
+        for step in steps:
+            if step.status == HIT:
+                self._show_hit(step)
+
+    def run(self) -> Report:
+        """Work until nothing is left to do, or until stopped."""
+        clock = time.monotonic()
+        previous = {n: signal.signal(n, self._on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while self._jobs or ((self._ready or self._waiting) and not self._stopping()):
+                self._decide_waiting()
+                self._launch()
+                self._collect()
+                self.display.refresh()
+                if not self._jobs and not self._ready and self._waiting and not self._decidable():
+                    break
+                time.sleep(_POLL_S)
+        finally:
+            for job in self._jobs.values():
+                job.kill()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+        self.report.not_started = [n.label for n in (*self._ready, *self._waiting)]
+        self.report.seconds = time.monotonic() - clock
+        return self.report
+
+    # ------------------------------------------------------------------ deciding
+
+    def _decidable(self) -> list[Node]:
+        return [n for n in self._waiting if self._blocked_by(n) or not self._unknown_inputs(n)]
+
+    def _unknown_inputs(self, node: Node) -> list[str]:
+        inputs = [n for nodes in self.planner.graph.inputs(node).values() for n in nodes]
+        return [n.label for n in inputs if n.label not in self.planner.results]
+
+    def _blocked_by(self, node: Node) -> str | None:
+        lost = {*self.report.failed, *self.report.bad_input, *self.report.interrupted, *self.report.blocked}
+        return next((label for label in self._unknown_inputs(node) if label in lost), None)
+
+    def _decide_waiting(self) -> None:
+        for node in list(self._waiting):
+            blocker = self._blocked_by(node)
+            if blocker is not None:
+                self._waiting.remove(node)
+                self.report.blocked[node.label] = blocker
+                self._tell(node, {"event": "blocked", "text": blocker})
+            elif not self._unknown_inputs(node):
+                self._waiting.remove(node)
+                self.planner.workspace.ledger.refresh()
+                step = self.planner.decide(node)
+                self._steps[node.label] = step
+                if step.status == HIT:
+                    self._show_hit(step)
+                else:
+                    self._ready.append(node)
+
+    def _show_hit(self, step: Step) -> None:
+        assert step.record is not None
+        self.report.hits.append(step.node.label)
+        if step.record.warnings:
+            self.report.warnings[step.node.label] = list(step.record.warnings)
+        self._tell(step.node, {"event": "hit"})
+        self._result(step.node, step.record.digest)
+
+    # ------------------------------------------------------------------ running
+
+    def _launch(self) -> None:
+        if self._stopping():
+            return
+        order = {node.label: i for i, node in enumerate(self.planner.graph.nodes)}
+        for node in sorted(self._ready, key=lambda n: order[n.label]):
+            granted = self.tokens.take(node.info.cpus, node.info.gpus)
+            if granted is None:
+                continue
+            self._ready.remove(node)
+            step = self._steps[node.label]
+            if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
+                self.workspace.objects.set_aside(node.info.name, step.record.digest)
+            cpus, gpus = granted
+            attempt = self.workspace.tmp / f"try-{self.folder.id}-{secrets.token_hex(4)}"
+            attempt.mkdir(parents=True)
+            request = self._request(step, cpus, gpus)
+            write_json(attempt / "request.json", request)
+            self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
+            self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
+
+    def _request(self, step: Step, cpus: int, gpus: list[str]) -> dict[str, Any]:
+        node, info = step.node, step.node.info
+        assert step.action is not None and info.code is not None
+        takes_sources = "video" in info.takes or "given" in info.takes
+        videos = [] if not takes_sources else [node.video] if node.video else self.planner.graph.videos
+        return {
+            "workspace": str(self.workspace.root),
+            "package_dir": str(self.planner.graph.definition.package_dir),
+            "reference": info.reference,
+            "data": list(info.data),
+            "label": node.label,
+            "stage": info.name,
+            "video": node.video_name,
+            "videos": [v.name for v in self.planner.graph.videos],
+            "key": step.action.key,
+            "action": step.action.text,
+            "modules": info.code.modules,
+            "settings": stage_values(self.planner.settings, info),
+            "inputs": self._folders(node),
+            "sources": [self._source(node, v) for v in videos],
+            "forced": node in self.planner.forced,
+            "run": self.folder.id,
+            "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            "device": "cuda" if gpus else "cpu",
+            "threads": cpus,
+            "grace_s": self._grace_s,
+            "watch_parent": True,
+        }
+
+    def _folders(self, node: Node) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, nodes in self.planner.graph.inputs(node).items():
+            folders = {}
+            for source in nodes:
+                digest = self.planner.results[source.label].digest
+                folders[source.video_name or ""] = {
+                    "path": str(self.workspace.objects.path(name, digest)),
+                    "digest": digest,
+                }
+            by_video = node.video is None and bool(nodes) and nodes[0].video is not None
+            found[name] = {"folders": folders} if by_video else {"folder": next(iter(folders.values()))}
+        return found
+
+    def _source(self, node: Node, video: VideoFile) -> dict[str, Any]:
+        digests = self.planner.sources
+        given = {s: p for s, p in video.given.items() if s in node.info.given and "given" in node.info.takes}
+        read = [*given.values(), *([video.path] if "video" in node.info.takes else [])]
+        return {
+            "name": video.name,
+            "path": str(video.path),
+            "digest": digests.of(video.path) if "video" in node.info.takes else "",
+            "is_folder": video.is_folder,
+            "given": {s: str(p) for s, p in given.items()},
+            "given_digests": {s: digests.of(p) for s, p in given.items()},
+            "states": {str(p): state_of(p) for p in read},
+        }
+
+    # ------------------------------------------------------------------ collecting
+
+    def _collect(self) -> None:
+        for node, job in list(self._jobs.items()):
+            outcome = job.poll()
+            for event in job.events.read():
+                self._tell(node, {k: v for k, v in event.items() if k != "label"})
+            if outcome is None:
+                continue
+            del self._jobs[node]
+            self.tokens.give_back(job.cpus, job.gpus)
+            self._finish(node, job, outcome)
+            remove_tree(job.attempt)
+
+    def _finish(self, node: Node, job: Job, outcome: Outcome) -> None:
+        seconds = round(time.monotonic() - job.started, 2)
+        note = self.workspace.attempts / f"{self._key(node)}.json"
+        if outcome.status == "done":
+            record = self.workspace.ledger.find(node.info.name, self._key(node))
+            if record is None:
+                outcome = Outcome("failed", "it said it was done but left no record")
+            else:
+                self.planner.finished(node, record)
+                self.report.done.append(node.label)
+                if record.warnings:
+                    self.report.warnings[node.label] = list(record.warnings)
+                note.unlink(missing_ok=True)
+                self._result(node, record.digest)
+        if outcome.status != "done":
+            if outcome.status == "interrupted" and not self._stopping():
+                outcome = Outcome("failed", outcome.message + " although nobody asked")
+            write_json(
+                note,
+                {
+                    "status": outcome.status,
+                    "message": outcome.message,
+                    "log": os.path.relpath(job.log_path, self.workspace.root),
+                    "label": node.label,
+                    "time": time.time(),
+                },
+            )
+            if outcome.status == "interrupted":
+                self.report.interrupted.append(node.label)
+            elif outcome.status == "bad_input":
+                self.report.bad_input[node.label] = outcome.message
+            else:
+                self.report.failed[node.label] = outcome.message
+            if self.fail_fast:
+                self._ask_all_to_stop()
+        log = os.path.relpath(job.log_path, self.workspace.root)
+        self._tell(node, {"event": outcome.status, "text": outcome.message, "seconds": seconds, "log": log})
+
+    def _key(self, node: Node) -> str:
+        step = self._steps[node.label]
+        assert step.action is not None
+        return step.action.key
+
+    def _result(self, node: Node, digest: str) -> None:
+        self.folder.link(node, digest)
+        if self.on_result is not None:
+            self.on_result(node)
+
+    def _tell(self, node: Node, event: dict[str, Any]) -> None:
+        self.folder.events({"label": node.label, **event})
+        self.display.event(node.label, event)
+
+    # ------------------------------------------------------------------ stopping
+
+    def _stopping(self) -> bool:
+        if self._signals:
+            return True
+        return self.fail_fast and bool(self.report.failed or self.report.bad_input)
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        self._signals += 1
+        self.report.stopped_by = self.report.stopped_by or number
+        if self._signals == 1:
+            self.display.event("", {"event": "stopping"})
+            self._ask_all_to_stop()
+        else:
+            for job in self._jobs.values():
+                job.kill()
+
+    def _ask_all_to_stop(self) -> None:
+        for job in self._jobs.values():
+            job.ask_to_stop(self._grace_s)
+

@@ -1,0 +1,263 @@
+"""Runs one action in one process: ``python -m pipeline.worker REQUEST.json``.
+
+The request names the stage, its inputs, settings and scratch; the outcome is a file beside the request. Standard
+input is a pipe from the parent: when it closes, the parent is gone and the worker stops. SIGTERM asks the stage to
+stop; what it checkpointed stays. Exit status: 0 done, 1 failed, 2 the input is at fault, 75 stopped and resumable.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from pipeline.contract import Folder, Given, Source, Stage
+from pipeline.describe import bind, build, load_stage, settings_class
+from pipeline.errors import BadInput, ExitCode, Interrupted, PipelineError, StageError, printable
+from pipeline.events import EventWriter
+from pipeline.files import failpoint, read_json, remove_tree, write_json
+from pipeline.ledger import Record
+from pipeline.running import Run
+from pipeline.source import CodeReader
+from pipeline.videos import state_of
+from pipeline.workspace import Workspace
+
+log = logging.getLogger("worker")
+
+
+def main(argv: list[str]) -> int:
+    """Run the request; returns the exit status."""
+    request_path = Path(argv[0])
+    request = read_json(request_path)
+    if not isinstance(request, dict):
+        sys.stderr.write(f"{request_path}: no request there\n")
+        return ExitCode.USAGE
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname).1s %(message)s", datefmt="%H:%M:%S"
+    )
+    return Worker(request, request_path.parent).run()
+
+
+class Worker:
+    """One attempt at one action. `attempt` is its scratch folder."""
+
+    def __init__(self, request: dict[str, Any], attempt: Path) -> None:
+        self.request, self.attempt = request, attempt
+        self.workspace = Workspace(Path(request["workspace"]))
+        self.events = EventWriter(attempt / "events.jsonl", {"label": request["label"]})
+        self.context = Run(
+            checkpoint_dir=self.workspace.checkpoints / request["key"],
+            video=request["video"],
+            videos=tuple(request["videos"]),
+            device=request["device"],
+            threads=request["threads"],
+            sink=self.events,
+            log=logging.getLogger(request["stage"]),
+        )
+        self.record: Record | None = None
+
+    def run(self) -> int:
+        """Run, write the outcome, return the exit status."""
+        self._watch()
+        with FileLock(self.attempt / "alive.lock"):
+            status, message, code = self._guarded()
+            outcome = {
+                "status": status,
+                "message": message,
+                "record": self.record.key if self.record else None,
+                "warnings": self.context.warnings,
+            }
+            write_json(self.attempt / "outcome.json", outcome)
+        return code
+
+    def _guarded(self) -> tuple[str, str, int]:
+        try:
+            self._run_leased()
+            return "done", "", ExitCode.DONE
+        except Interrupted:
+            log.info("stopped on request; checkpoints are kept")
+            return "interrupted", "stopped on request", ExitCode.INTERRUPTED
+        except BadInput as error:
+            log.error("%s", error)
+            return "bad_input", str(error), ExitCode.USAGE
+        except PipelineError as error:
+            log.error("%s", error)
+            return "failed", str(error), ExitCode.FAILED
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                text = str(
+                    BadInput("the disk is full", where=self.workspace.root, hint="free some space and run again")
+                )
+                log.error("%s", text)
+                return "bad_input", text, ExitCode.USAGE
+            return self._failure(error)
+        except KeyboardInterrupt:
+            return "interrupted", "stopped on request", ExitCode.INTERRUPTED
+        except BaseException as error:
+            return self._failure(error)
+
+    def _failure(self, error: BaseException) -> tuple[str, str, int]:
+        traceback.print_exc(file=sys.stderr)
+        last = traceback.format_exception_only(type(error), error)[-1].strip()
+        return "failed", printable(last), ExitCode.FAILED
+
+    # ------------------------------------------------------------------ the action
+
+    def _run_leased(self) -> None:
+        lease = self.workspace.lease(self.request["key"])
+        told = False
+        while True:
+            try:
+                lease.acquire(timeout=0.3)
+                break
+            except Timeout:
+                if not told:
+                    self.events({"event": "waiting", "text": "another run is making this"})
+                    told = True
+                if self.context.stop_requested:
+                    raise Interrupted("stopped while waiting for another run") from None
+        try:
+            existing = self.workspace.ledger.find(self.request["stage"], self.request["key"])
+            if existing is not None and self._serves(existing):
+                log.info("another run has made this meanwhile")
+                self.record = existing
+                return
+            self._make()
+        finally:
+            lease.release()
+
+    def _serves(self, record: Record) -> bool:
+        if self.request["forced"] and record.finished <= self.request["created"]:
+            return False
+        return self.workspace.objects.sound(record.stage, record.digest)
+
+    def _make(self) -> None:
+        request = self.request
+        started = datetime.now(UTC)
+        clock = time.monotonic()
+        self.events({"event": "started", "pid": os.getpid()})
+        out = self.attempt / "out"
+        out.mkdir()
+        found = load_stage(request["reference"])
+        self._same_code()
+        known = self._arguments(found, out)
+        found.function(**bind(found, found.function, known))
+        for check in found.checks:
+            check(**bind(found, check, known))
+        self._same_sources()
+        failpoint("before_publish")
+        stored = self.workspace.objects.publish(request["stage"], out)
+        self.record = Record(
+            key=request["key"],
+            stage=request["stage"],
+            video=request["video"],
+            action=request["action"],
+            modules=request["modules"],
+            digest=stored.digest,
+            files=stored.files,
+            bytes=stored.bytes,
+            seconds=round(time.monotonic() - clock, 3),
+            started=_stamp(started),
+            finished=_stamp(datetime.now(UTC)),
+            run=request["run"],
+            metrics=self.context.metrics,
+            warnings=self.context.warnings,
+            host=socket.gethostname(),
+            versions=_versions(),
+        )
+        self.workspace.ledger.write(self.record)
+        remove_tree(self.workspace.checkpoints / request["key"])
+
+    def _arguments(self, found: Stage, out: Path) -> dict[str, Any]:
+        request = self.request
+
+        def folder(value: dict[str, str]) -> Folder:
+            return Folder(Path(value["path"]), value["digest"])
+
+        known: dict[str, Any] = {"out": out, "run": self.context}
+        for name, value in request["inputs"].items():
+            if "folders" in value:
+                known[name] = {v: folder(f) for v, f in sorted(value["folders"].items())}
+            else:
+                known[name] = folder(value["folder"])
+        sources = {
+            v["name"]: Source(Path(v["path"]), v["name"], v["digest"], v["is_folder"]) for v in request["sources"]
+        }
+        given = {
+            v["name"]: Given({s: Path(p) for s, p in v["given"].items()}, v["given_digests"]) for v in request["sources"]
+        }
+        only = request["video"]
+        if sources:
+            known["video"] = sources[only] if only else dict(sorted(sources.items()))
+            known["given"] = given[only] if only else dict(sorted(given.items()))
+        kind = settings_class(found)
+        if kind is not None:
+            known["settings"] = build(kind, request["settings"])
+        return known
+
+    def _same_code(self) -> None:
+        """Refuse to file the work of other code under this key."""
+        package = Path(self.request["package_dir"])
+        module = self.request["reference"].partition(":")[0]
+        code = CodeReader(package).fingerprint(module, tuple(self.request["data"]))
+        if code.digest != self.request["action"]["code"]:
+            raise StageError("the code changed after the run was planned", hint="run again")
+
+    def _same_sources(self) -> None:
+        for source in self.request["sources"]:
+            for path, before in source["states"].items():
+                try:
+                    now = state_of(Path(path))
+                except OSError:
+                    now = []
+                if now != before:
+                    raise BadInput("it changed while it was being read", where=path, hint="run again when it is complete")
+
+    # ------------------------------------------------------------------ stopping
+
+    def _watch(self) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, lambda *_: self.context.request_stop())
+        if self.request.get("watch_parent"):
+            threading.Thread(target=self._watch_parent, daemon=True).start()
+
+    def _watch_parent(self) -> None:
+        """Standard input closes when the parent dies: stop cleanly, and at once when that takes too long."""
+        try:
+            while os.read(0, 1024):
+                pass
+        except OSError:
+            pass
+        self.context.request_stop()
+        time.sleep(float(self.request["grace_s"]))
+        log.error("the parent is gone and the stage does not stop; leaving")
+        os._exit(ExitCode.INTERRUPTED)
+
+
+def _stamp(moment: datetime) -> str:
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _versions() -> dict[str, str]:
+    """Versions of Python and of the libraries this action has loaded."""
+    found = {"python": sys.version.split()[0]}
+    for name, module in sorted(sys.modules.items()):
+        version = getattr(module, "__version__", None)
+        if "." not in name and not name.startswith("_") and isinstance(version, str):
+            found[name] = version
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
