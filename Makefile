@@ -85,7 +85,7 @@ lint: $(STAMP)  ## style
 	$(VENV)/bin/lint-imports
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code
-	$(PYTHON) -m workspace_template.generate
+	$(PYTHON) docs/generate.py
 
 clean:  ## remove build products; workspaces and the environment stay
 	rm -rf build .pytest_cache .hypothesis .ruff_cache .import_linter_cache
