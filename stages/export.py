@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ def export_model(
     writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), {"views": views.astype(np.float32)})
     (out / "rest.ply").write_bytes(writer.encode(rig.mesh.vertices))
     formats.write_json(out / "bones.json", _bones(model, rig))
-    report = _report(rig, figures, views, pose_summary)
+    report = quality.report(rig.mesh, rig.normals, rig.facts, figures, views, pose_summary)
     formats.write_json(out / "quality.json", report)
 
     joint_idx, weight = rig.skin(settings.influences)
@@ -212,8 +212,8 @@ def _look(rig: Rig, colour: np.ndarray) -> pictures.Look:
 
 def _write_turntable(out: Path, rig: Rig, colour: np.ndarray, settings: ExportSettings, run: Run) -> None:
     side = max(2, settings.video_side_px // 2 * 2)
-    joints = rig.skeleton.rest[:, :3, 3]
-    images = pictures.turntable(_look(rig, colour), rig.mesh.vertices, joints, settings.turntable_frames, side)
+    sticks = rig.skeleton.sticks(rig.skeleton.rest)
+    images = pictures.turntable(_look(rig, colour), rig.mesh.vertices, sticks, settings.turntable_frames, side)
     shown = run.progress(images, settings.turntable_frames, "turntable")
     write_video(out / "turntable.mp4", shown, np.arange(settings.turntable_frames) / 24)
 
@@ -228,14 +228,15 @@ def _write_overlay(
     shown = np.maximum(np.searchsorted(clip.source_idx, np.arange(len(posed.vertices)), side="right") - 1, 0)
 
     def draw() -> Iterator[np.ndarray]:
-        held, frame = -1, np.zeros((height, width, 3), np.uint8)
+        held = -1
+        frame: np.ndarray = np.zeros((height, width, 3), np.uint8)
         for i, pose in enumerate(posed.camera_from_object):
             if shown[i] != held:
                 held = int(shown[i])
-                frame = cv2.resize(clip.image(held), (width, height), interpolation=cv2.INTER_AREA)
+                frame = np.asarray(cv2.resize(clip.image(held), (width, height), interpolation=cv2.INTER_AREA))
             points = posed.vertices[i] @ pose[:3, :3].T + pose[:3, 3]
-            joints = posed.joints[i, :, :3, 3] @ pose[:3, :3].T + pose[:3, 3]
-            yield pictures.overlay(look, points, joints, intrinsics, frame)
+            sticks = rig.skeleton.sticks(posed.joints[i]) @ pose[:3, :3].T + pose[:3, 3]
+            yield pictures.overlay(look, points, sticks, intrinsics, frame)
 
     images = run.progress(draw(), len(posed.vertices), f"overlay {video.name}")
     write_video(out / f"overlay-{video.name}.mp4", images, clip.source_time_s)
@@ -243,16 +244,18 @@ def _write_overlay(
 
 def _bones(model: Animatable, rig: Rig) -> dict[str, Any]:
     skeleton, scales = rig.skeleton, model.bone_scales.cpu().numpy()
+    orientations = model.bone_orientations.cpu().numpy().astype(np.float64)
     share = rig.weights.mean(axis=0)
     return {
-        "space": "canonical: y up, z front; the Gaussians' axes are the columns of orientation",
+        "space": "canonical: y up, z front; a joint is where the bone holds its parent; columns of orientation are the Gaussian's axes",
         "bones": [
             {
                 "name": skeleton.names[j],
                 "parent": skeleton.names[p] if p >= 0 else None,
                 "model_bone": int(b),
-                "centre": skeleton.rest[j, :3, 3].tolist(),
-                "orientation": skeleton.rest[j, :3, :3].tolist(),
+                "joint": skeleton.rest[j, :3, 3].tolist(),
+                "centre": skeleton.centre[j].tolist(),
+                "orientation": orientations[b].tolist(),
                 "scale": [float(v) for v in scales[b]],
                 "surface_share": round(float(share[b]), 6),
             }
@@ -295,36 +298,3 @@ def _measure(video: _Inputs, rig: Rig, posed: PosedClip, views: np.ndarray, run:
         posed.skinning_error[8],
         posed.skinning_error[4],
     )
-
-
-def _report(
-    rig: Rig, figures: list[quality.ClipQuality], views: np.ndarray, pose_summary: dict[str, Any]
-) -> dict[str, Any]:
-    areas = quality.vertex_areas(rig.mesh.vertices, rig.mesh.faces)
-    unseen = float(areas[views == 0].sum() / max(areas.sum(), 1e-12))
-    side = quality.unseen_side(areas, rig.normals, views > 0)
-    trust, advice = pose_summary.get("trust"), pose_summary.get("advice")
-    verdict = quality.judge(
-        figures,
-        float(trust) if isinstance(trust, int | float) else None,
-        advice if isinstance(advice, str) else None,
-        unseen,
-        side,
-        rig.facts.dropped_area,
-        rig.facts.level,
-    )
-    iou = np.concatenate([f.iou for f in figures])
-    return {
-        "trust": round(verdict.trust, 3),
-        "verdict": verdict.word,
-        "trust_parts": {k: round(v, 3) for k, v in verdict.parts.items()},
-        "advice": verdict.advice,
-        "iou_mean": quality.mean_number(iou),
-        "unseen_area": round(unseen, 4),
-        "skinning_error": round(max(f.skinning_error_8 for f in figures), 6),
-        "skinning_error_4": round(max(f.skinning_error_4 for f in figures), 6),
-        "length": rig.mesh.length,
-        "joints": len(rig.skeleton),
-        **asdict(rig.facts),
-        "videos": {f.name: f.as_json() for f in figures},
-    }

@@ -7,6 +7,7 @@ candidate pixel of every triangle is tested in one vectorised pass and the neare
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,18 +34,25 @@ class Fragments:
         """(H, W) bool silhouette."""
         return self.face_idx >= 0
 
+    def pixels(self) -> np.ndarray:
+        """(P,) indices of covered pixels in the flattened image."""
+        return np.flatnonzero(self.covered)
+
+    def at_pixels(self, pixels: np.ndarray, faces: np.ndarray, attribute: np.ndarray) -> np.ndarray:
+        """A vertex attribute (V, C) at covered `pixels` (P,): (P, C) float32."""
+        corners = faces[self.face_idx.reshape(-1)[pixels]]
+        weight = self.barycentric.reshape(-1, 3)[pixels]
+        values = attribute.astype(np.float32)
+        mixed = values[corners[:, 0]] * weight[:, :1]
+        mixed += values[corners[:, 1]] * weight[:, 1:2]
+        mixed += values[corners[:, 2]] * weight[:, 2:]
+        return mixed
+
     def interpolate(self, faces: np.ndarray, attribute: np.ndarray, background: float = 0.0) -> np.ndarray:
         """Spread a vertex attribute (V, C) over the pixels: (H, W, C) float32, `background` off the mesh."""
         image = np.full((*self.face_idx.shape, attribute.shape[1]), background, np.float32)
-        rows, columns = np.nonzero(self.covered)
-        corners = faces[self.face_idx[rows, columns]]
-        weight = self.barycentric[rows, columns]
-        values = attribute.astype(np.float32)
-        image[rows, columns] = (
-            values[corners[:, 0]] * weight[:, :1]
-            + values[corners[:, 1]] * weight[:, 1:2]
-            + values[corners[:, 2]] * weight[:, 2:]
-        )
+        pixels = self.pixels()
+        image.reshape(-1, attribute.shape[1])[pixels] = self.at_pixels(pixels, faces, attribute)
         return image
 
 
@@ -141,7 +149,7 @@ def _passes(count: np.ndarray) -> list[tuple[int, int]]:
     while bounds[-1] < len(count):
         used = total[bounds[-1] - 1] if bounds[-1] else 0
         bounds.append(max(bounds[-1] + 1, int(np.searchsorted(total, used + _CANDIDATES_PER_PASS, side="right"))))
-    return list(zip(bounds[:-1], bounds[1:], strict=True))
+    return list(itertools.pairwise(bounds))
 
 
 def _finish(faces: np.ndarray, depth: np.ndarray, weight: np.ndarray, height_px: int, width_px: int) -> Fragments:

@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.geometry.raster import project, rasterise, vertex_normals
 
-_LIGHT = np.array([-0.35, -0.55, -0.76])  # camera frame: from above, left of and behind the camera
+_LIGHT = np.array([-0.35, -0.55, -0.76], np.float32)  # camera frame: from above, left of and behind the camera
 _PAPER = 0.93
 
 
@@ -44,7 +44,7 @@ def scaled_intrinsics(intrinsics: np.ndarray, width_px: int, height_px: int, new
 def paint(
     look: Look,
     vertices_camera: np.ndarray,
-    joints_camera: np.ndarray,
+    sticks_camera: np.ndarray,
     intrinsics: np.ndarray,
     background: np.ndarray,
     supersample: int = 1,
@@ -52,7 +52,7 @@ def paint(
     """Two pictures of the mesh before a camera: in its colour over `background`, and in its skin colours with bones.
 
     Args:
-        vertices_camera: (V, 3); joints_camera: (B, 3), camera frame.
+        vertices_camera: (V, 3); sticks_camera: (B, 2, 3), joint and centre of each bone; camera frame.
         intrinsics: (3, 3) for pictures of the background's size.
         background: (H, W, 3) in 0..1.
         supersample: rays per pixel along each side.
@@ -64,32 +64,35 @@ def paint(
     k = np.diag([supersample, supersample, 1.0]) @ intrinsics
     fragments = rasterise(vertices_camera, look.faces, k, height * supersample, width * supersample)
     attribute = np.concatenate([look.colour, look.skin, vertex_normals(vertices_camera, look.faces)], axis=1)
-    values = fragments.interpolate(look.faces, attribute)
-    normal = values[..., 6:]
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    lit = np.clip((normal @ _LIGHT)[..., None], 0, 1)
-    layers = np.concatenate(
-        [values[..., :3] * (0.72 + 0.33 * lit), values[..., 3:6] * (0.5 + 0.55 * lit), fragments.covered[..., None]], axis=-1
-    ).astype(np.float32)
+    pixels = fragments.pixels()
+    values = fragments.at_pixels(pixels, look.faces, attribute)
+    length = np.sqrt(np.einsum("pc,pc->p", values[:, 6:], values[:, 6:]))
+    lit = np.clip(values[:, 6:] @ _LIGHT / np.maximum(length, 1e-6), 0, 1)[:, None]
+    layers = np.zeros((height * supersample, width * supersample, 7), np.float32)
+    layers.reshape(-1, 7)[pixels] = np.concatenate(
+        [values[:, :3] * (0.72 + 0.33 * lit), values[:, 3:6] * (0.5 + 0.55 * lit), np.ones_like(lit)], axis=1
+    )
     if supersample > 1:
-        layers = layers.reshape(height, supersample, width, supersample, 7).mean(axis=(1, 3))
+        layers = cv2.resize(layers, (width, height), interpolation=cv2.INTER_AREA)
     alpha = layers[..., 6:]
     coloured = np.clip(layers[..., :3] + (1 - alpha) * background, 0, 1)
     skinned = np.clip(layers[..., 3:6] + (1 - alpha) * _PAPER, 0, 1)
-    pictures = [np.round(p * 255).astype(np.uint8) for p in (coloured, skinned)]
-    _draw_bones(pictures[1], joints_camera, look.parent, intrinsics)
+    pictures = [(p * 255 + 0.5).astype(np.uint8) for p in (coloured, skinned)]
+    _draw_bones(pictures[1], sticks_camera, look.parent, intrinsics)
     return pictures[0], pictures[1]
 
 
-def _draw_bones(picture: np.ndarray, joints_camera: np.ndarray, parent: np.ndarray, intrinsics: np.ndarray) -> None:
-    if (joints_camera[:, 2] < 0.05).any():
+def _draw_bones(picture: np.ndarray, sticks_camera: np.ndarray, parent: np.ndarray, intrinsics: np.ndarray) -> None:
+    if (sticks_camera[..., 2] < 0.05).any():
         return
-    pixel = np.clip(project(joints_camera, intrinsics) * 16, -1e6, 1e6).astype(int)
-    for j, p in enumerate(parent):
+    pixel = project(sticks_camera.reshape(-1, 3), intrinsics).reshape(-1, 2, 2)
+    pixel = np.clip(pixel * 16, -1e6, 1e6).astype(int)  # cv2 draws with four fractional bits
+    for (joint, centre), p in zip(pixel.tolist(), parent.tolist(), strict=True):
+        cv2.line(picture, joint, centre, (40, 40, 40), 1, cv2.LINE_AA, 4)
         if p >= 0:
-            cv2.line(picture, tuple(pixel[j].tolist()), tuple(pixel[p].tolist()), (40, 40, 40), 1, cv2.LINE_AA, 4)
-    for point in pixel:
-        cv2.circle(picture, tuple(point.tolist()), 32, (20, 20, 20), -1, cv2.LINE_AA, 4)
+            cv2.line(picture, pixel[p, 1].tolist(), joint, (40, 40, 40), 1, cv2.LINE_AA, 4)
+    for joint, _ in pixel.tolist():
+        cv2.circle(picture, joint, 36, (20, 20, 20), -1, cv2.LINE_AA, 4)
 
 
 def orbit(azimuth: float, elevation: float, centre: np.ndarray, distance: float) -> np.ndarray:
@@ -106,7 +109,7 @@ def orbit(azimuth: float, elevation: float, centre: np.ndarray, distance: float)
     return pose
 
 
-def turntable(look: Look, vertices: np.ndarray, joints: np.ndarray, frames: int, side_px: int) -> Iterator[np.ndarray]:
+def turntable(look: Look, vertices: np.ndarray, sticks: np.ndarray, frames: int, side_px: int) -> Iterator[np.ndarray]:
     """One turn about the rest pose, (side, 2 side, 3) uint8 pictures: in colour, and in skin colours with bones."""
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
@@ -117,14 +120,14 @@ def turntable(look: Look, vertices: np.ndarray, joints: np.ndarray, frames: int,
     for i in range(frames):
         pose = orbit(2 * np.pi * i / frames, np.radians(12), centre, distance)
         points = vertices @ pose[:3, :3].T + pose[:3, 3]
-        bones = joints @ pose[:3, :3].T + pose[:3, 3]
+        bones = sticks @ pose[:3, :3].T + pose[:3, 3]
         yield np.concatenate(paint(look, points, bones, intrinsics, background, supersample=2), axis=1)
 
 
 def overlay(
-    look: Look, vertices_camera: np.ndarray, joints_camera: np.ndarray, intrinsics: np.ndarray, frame: np.ndarray
+    look: Look, vertices_camera: np.ndarray, sticks_camera: np.ndarray, intrinsics: np.ndarray, frame: np.ndarray
 ) -> np.ndarray:
     """A frame (H, W, 3) uint8, the mesh in its place over the paled frame, and its bones: (H, 3 W, 3) uint8."""
     grey = frame.astype(np.float32).mean(axis=-1, keepdims=True) / 255
     pale = np.repeat(0.55 + 0.4 * grey, 3, axis=-1)
-    return np.concatenate([frame, *paint(look, vertices_camera, joints_camera, intrinsics, pale)], axis=1)
+    return np.concatenate([frame, *paint(look, vertices_camera, sticks_camera, intrinsics, pale)], axis=1)

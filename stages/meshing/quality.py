@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from stages.geometry.raster import Fragments, face_normals, project
+from stages.meshing.surface import Mesh, SurfaceFacts
 
 POOR_OUTLINE = 0.6
 POOR_CONFIDENCE = 0.5
@@ -89,7 +91,7 @@ class ClipQuality:
                 flags.append("outline")
             if self.root_confidence[i] < POOR_CONFIDENCE:
                 flags.append("pose")
-            row = {"source_idx": int(self.source_idx[i]), "iou": number(self.iou[i])}
+            row: dict[str, Any] = {"source_idx": int(self.source_idx[i]), "iou": number(self.iou[i])}
             row |= {"root_confidence": number(self.root_confidence[i])}
             rows.append(row | {"mask_confidence": number(self.mask_confidence[i]), "flags": flags})
         return {
@@ -183,3 +185,45 @@ def _mean(values: list[np.ndarray]) -> float:
     everything = np.concatenate(values) if values else np.zeros(0)
     finite = everything[np.isfinite(everything)]
     return float(finite.mean()) if len(finite) else 0.0
+
+
+def report(
+    mesh: Mesh,
+    normals: np.ndarray,
+    facts: SurfaceFacts,
+    clips: Sequence[ClipQuality],
+    views: np.ndarray,
+    pose_summary: dict[str, Any],
+) -> dict[str, Any]:
+    """Everything in ``quality.json``.
+
+    Args:
+        mesh, normals, facts: the surface at rest.
+        views: (V,) frames that saw each vertex.
+        pose_summary: ``poses.json``: its `trust` and `advice` are used if they are there.
+    """
+    areas = vertex_areas(mesh.vertices, mesh.faces)
+    unseen = float(areas[views == 0].sum() / max(areas.sum(), 1e-12))
+    trust, advice = pose_summary.get("trust"), pose_summary.get("advice")
+    verdict = judge(
+        clips,
+        float(trust) if isinstance(trust, int | float) else None,
+        advice if isinstance(advice, str) else None,
+        unseen,
+        unseen_side(areas, normals, views > 0),
+        facts.dropped_area,
+        facts.level,
+    )
+    return {
+        "trust": round(verdict.trust, 3),
+        "verdict": verdict.word,
+        "trust_parts": {k: round(v, 3) for k, v in verdict.parts.items()},
+        "advice": verdict.advice,
+        "iou_mean": mean_number(np.concatenate([c.iou for c in clips])),
+        "unseen_area": round(unseen, 4),
+        "skinning_error": number(max(c.skinning_error_8 for c in clips), 6),
+        "skinning_error_4": number(max(c.skinning_error_4 for c in clips), 6),
+        "length": mesh.length,
+        **asdict(facts),
+        "videos": {c.name: c.as_json() for c in clips},
+    }

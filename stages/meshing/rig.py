@@ -128,7 +128,6 @@ def build_rig(model: Animatable, clip_times_s: Sequence[np.ndarray], resolution:
     motion = [_bone_motion(model, k, times) for k, times in enumerate(clip_times_s)]
     skeleton = build_skeleton(
         model.bone_centres.cpu().numpy(),
-        model.bone_orientations.cpu().numpy(),
         np.concatenate(motion),
         weights,
         mesh.vertices,

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+_PULL = 0.02  # squared radians: relative rotations below about eight degrees do not move a joint much
+
 
 @dataclass(frozen=True)
 class Skeleton:
@@ -20,13 +22,15 @@ class Skeleton:
     names: one a joint, e.g. ``bone_07``.
     bone: (B,) index of each joint's bone in the model.
     parent: (B,) index of the parent joint, -1 for the root (which is joint 0).
-    rest: (B, 4, 4) object_from_joint at rest, rigid, float64.
+    rest: (B, 4, 4) object_from_joint at rest, float64: upright axes, at the point where the joint holds the parent.
+    centre: (B, 3) centre of the joint's bone at rest.
     """
 
     names: list[str]
     bone: np.ndarray
     parent: np.ndarray
     rest: np.ndarray
+    centre: np.ndarray
 
     def __len__(self) -> int:
         return len(self.names)
@@ -40,6 +44,12 @@ class Skeleton:
     def posed(self, bone_transforms: np.ndarray) -> np.ndarray:
         """Object_from_joint (T, B, 4, 4), joint order, of canonical-to-posed bone transforms (T, B, 4, 4), bone order."""
         return nearest_rigid(bone_transforms[:, self.bone].astype(np.float64)) @ self.rest
+
+    def sticks(self, posed: np.ndarray) -> np.ndarray:
+        """Ends (..., B, 2, 3) of each bone, joint and centre, in object space, of object_from_joint (..., B, 4, 4)."""
+        offset = self.centre - self.rest[:, :3, 3]
+        joint = posed[..., :3, 3]
+        return np.stack([joint, joint + (posed[..., :3, :3] @ offset[..., None])[..., 0]], axis=-2)
 
     def local(self, posed: np.ndarray) -> np.ndarray:
         """Parent_from_joint (..., B, 4, 4) of object_from_joint (..., B, 4, 4); the root's is its own."""
@@ -71,73 +81,73 @@ def invert(transforms: np.ndarray) -> np.ndarray:
     return result
 
 
-def joint_costs(centres: np.ndarray, transforms: np.ndarray, length: float) -> np.ndarray:
-    """Cost (B, B) of joining each pair of bones, symmetric, zero on the diagonal, in units of the object's length.
+def pair_joints(centres: np.ndarray, transforms: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """The best common joint of every pair of bones, and what joining them would cost.
 
-    For bones a and b with motions J_a(t), J_b(t) the joint is the point p that minimises
-    ``mean_t |J_a(t) p - J_b(t) p|^2 + w |p - (c_a + c_b) / 2|^2``; the cost is the root of the first term at p, plus
-    the distance of the centres.
+    For bones a and b with motions J_a(t), J_b(t) the joint is the point p, at rest, that minimises
+    ``mean_t |J_a(t) p - J_b(t) p|^2 + w |p - (c_a + c_b) / 2|^2``; the cost is the root of the first term at p, twice,
+    plus the distance of the centres, in units of the object's length.
 
     Args:
         centres: (B, 3) at rest.
         transforms: (T, B, 4, 4) canonical to posed.
         length: longest edge of the object's box.
+
+    Returns:
+        Costs (B, B), symmetric with zero diagonal; points (B, B, 3), the diagonal holds the centres.
     """
     count = len(centres)
     first, second = np.triu_indices(count, 1)
     difference = transforms[:, first] - transforms[:, second]
     a, b = difference[..., :3, :3], difference[..., :3, 3]
     middle = (centres[first] + centres[second]) / 2
-    pull = 0.02
-    normal = np.einsum("tpij,tpik->pjk", a, a) / len(a) + pull * np.eye(3)
-    right = -np.einsum("tpij,tpi->pj", a, b) / len(a) + pull * middle
-    joint = np.linalg.solve(normal, right[..., None])[..., 0]
-    slip = np.sqrt((np.einsum("tpij,pj->tpi", a, joint) + b).__pow__(2).sum(-1).mean(0))
     apart = np.linalg.norm(centres[first] - centres[second], axis=1)
-    cost = np.zeros((count, count))
+    normal = np.einsum("tpij,tpik->pjk", a, a) / len(a) + _PULL * np.eye(3)
+    right = -np.einsum("tpij,tpi->pj", a, b) / len(a) + _PULL * middle
+    shift = np.linalg.solve(normal, right[..., None])[..., 0] - middle
+    # A joint far off both bones says that they move alike or not at all: keep it between them.
+    shift *= np.minimum(1, 0.6 * apart / np.maximum(np.linalg.norm(shift, axis=1), 1e-12))[:, None]
+    joint = middle + shift
+    slip = np.sqrt(((np.einsum("tpij,pj->tpi", a, joint) + b) ** 2).sum(axis=-1).mean(axis=0))
+    cost, point = np.zeros((count, count)), np.zeros((count, count, 3))
     cost[first, second] = cost[second, first] = (2.0 * slip + apart) / length
-    return cost
+    point[first, second] = point[second, first] = joint
+    point[np.arange(count), np.arange(count)] = centres
+    return cost, point
 
 
 def build_skeleton(
-    centres: np.ndarray,
-    orientations: np.ndarray,
-    transforms: np.ndarray,
-    weights: np.ndarray,
-    vertices: np.ndarray,
+    centres: np.ndarray, transforms: np.ndarray, weights: np.ndarray, vertices: np.ndarray
 ) -> Skeleton:
     """Join the model's bones into a tree.
 
     The root is the bone from which the others, weighted by the surface they move, are nearest along the tree.
 
     Args:
-        centres: (B, 3); orientations: (B, 3, 3): bones at rest, canonical space.
+        centres: (B, 3) of the bones at rest, canonical space.
         transforms: (T, B, 4, 4) canonical to posed, over all clips.
         weights: (V, B) skinning weights at rest.
         vertices: (V, 3) surface at rest.
     """
+    centres = centres.astype(np.float64)
     count = len(centres)
-    length = float(np.ptp(vertices, axis=0).max())
+    cost, point = pair_joints(centres, transforms.astype(np.float64), float(np.ptp(vertices, axis=0).max()))
+    # Bones that share skin belong together: overlap makes an edge up to a third cheaper.
+    overlap = weights.T @ weights
+    overlap = overlap / np.sqrt(np.maximum(np.outer(np.diag(overlap), np.diag(overlap)), 1e-12))
+    cost = np.maximum(cost * (1 - overlap / 3), 1e-9) * (1 - np.eye(count))
+    tree = sparse.csgraph.minimum_spanning_tree(sparse.csr_matrix(cost))
+    along = sparse.csgraph.shortest_path(tree, directed=False)
+    root = int((along @ (weights.mean(axis=0) + 1e-6)).argmin())
+    order, before = sparse.csgraph.breadth_first_order(tree, root, directed=False)
+    position = np.empty(count, np.int64)
+    position[order] = np.arange(count)
+    parent_bone = np.where(before[order] < 0, order, before[order])
+    parent = np.where(before[order] < 0, -1, position[parent_bone])
     rest = np.tile(np.eye(4), (count, 1, 1))
-    rest[:, :3, :3], rest[:, :3, 3] = orientations, centres
-    rest = nearest_rigid(rest)
-    share = weights.mean(axis=0)
-    if count == 1:
-        order, parent = np.zeros(1, np.int64), np.full(1, -1)
-    else:
-        # Bones that share skin belong together: overlap makes an edge up to a third cheaper.
-        overlap = weights.T @ weights
-        overlap = overlap / np.sqrt(np.maximum(np.outer(np.diag(overlap), np.diag(overlap)), 1e-12))
-        cost = joint_costs(centres.astype(np.float64), transforms.astype(np.float64), length) * (1 - overlap / 3)
-        tree = sparse.csgraph.minimum_spanning_tree(sparse.csr_matrix(np.maximum(cost, 1e-9) * (1 - np.eye(count))))
-        along = sparse.csgraph.shortest_path(tree, directed=False)
-        root = int((along @ (share + 1e-6)).argmin())
-        order, before = sparse.csgraph.breadth_first_order(tree, root, directed=False)
-        position = np.empty(count, np.int64)
-        position[order] = np.arange(count)
-        parent = np.where(before[order] < 0, -1, position[np.maximum(before[order], 0)])
+    rest[:, :3, 3] = point[order, parent_bone]
     names = [f"bone_{int(b):02d}" for b in order]
-    return Skeleton(names, order.astype(np.int64), parent.astype(np.int64), rest[order])
+    return Skeleton(names, order.astype(np.int64), parent.astype(np.int64), rest, centres[order])
 
 
 def top_influences(weights: np.ndarray, influences: int) -> tuple[np.ndarray, np.ndarray]:
