@@ -60,14 +60,14 @@ class PlainDisplay:
             if now - self._told.get(label, 0.0) >= self._interval_s:
                 self._told[label] = now
                 self._line(f"{label}: {progress_text(event)}")
-        elif kind == "warning":
-            self._line(f"{label}: warning: {text}")
         elif kind == "done":
             self._line(f"{label}: done in {duration(event['seconds'])}")
-        elif kind in ("failed", "bad_input"):
+        elif kind == "failed":
             self._line(f"{label}: failed: {text}")
+        elif kind == "bad_input":
+            self._line(f"{label}: failed, its input is at fault")
         elif kind == "interrupted":
-            self._line(f"{label}: stopped ({text}); it resumes from its checkpoint")
+            self._line(f"{label}: {text}; the next run goes on from its checkpoint")
         elif kind == "waiting":
             self._line(f"{label}: {text}; waiting")
         elif kind == "stopping":

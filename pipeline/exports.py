@@ -12,39 +12,48 @@ from pipeline.errors import BadInput
 from pipeline.files import read_json, remove_tree, unique, write_json
 from pipeline.ledger import Record
 from pipeline.objects import walk
-from pipeline.plan import Planner, Step
+from pipeline.plan import Planner
 from pipeline.project import Project
 
 PROVENANCE = "provenance.json"
 
 
-def export(project: Project, steps: list[Step], planner: Planner | None = None) -> Path | None:
-    """Copy the last stage's folder to ``exports/`` unless it is there already; None when there is none."""
+def export(project: Project, planner: Planner, to: Path | None = None) -> Path | None:
+    """Copy the last stage's folder to ``exports/`` unless it is there already; None when it has no result."""
     last = list(project.definition.stages)[-1]
-    results = planner.results if planner else {s.node.label: s.record for s in steps if s.record}
-    records = {s.node.video_name: results[s.node.label] for s in steps if s.node.info.name == last}
-    if not records:
+    nodes = project.graph.of_stage(last)
+    records = {n.video_name: planner.results[n.label] for n in nodes if n.label in planner.results}
+    if len(records) < len(nodes):
         return None
-    target = project.workspace.exports
+    target = to or project.workspace.exports
+    with project.workspace.exclusive():
+        _export(project, planner, records, target)
+    return target
+
+
+def _export(project: Project, planner: Planner, records: dict[str | None, Record], target: Path) -> None:
     wanted = {video or "": record.digest for video, record in records.items()}
     before = read_json(target / PROVENANCE)
-    before = before if isinstance(before, dict) else {}
-    if before.get("digests") == wanted and _complete(target, before.get("files", {})):
-        return target
-    fresh = project.workspace.tmp / f"export-{unique()}"
-    for video, record in records.items():
-        if not project.workspace.objects.sound(record.stage, record.digest):
-            raise BadInput(f"the result of {record.label} is damaged", hint="run again")
-        _copy(project.workspace.objects.path(record.stage, record.digest), fresh / video if video else fresh)
-    files = {name: [s.st_size, s.st_mtime_ns] for name, _, s in walk(fresh)}
-    write_json(fresh / PROVENANCE, _provenance(project, wanted, files, results))
-    _keep_foreign(target, fresh, before.get("files", {}))
-    retired = project.workspace.tmp / f"retired-{unique()}"
-    if target.exists():
-        os.rename(target, retired)
-    os.rename(fresh, target)
-    remove_tree(retired)
-    return target
+    before = before if isinstance(before, dict) and isinstance(before.get("files"), dict) else {"files": {}}
+    if before.get("digests") == wanted and _complete(target, before["files"]):
+        return
+    fresh = target.with_name(f".{target.name}-{unique()}")
+    try:
+        fresh.mkdir(parents=True)
+        for video, record in records.items():
+            if not project.workspace.objects.sound(record.stage, record.digest):
+                raise BadInput(f"the result of {record.label} is damaged", hint="run again")
+            _copy(project.workspace.objects.path(record.stage, record.digest), fresh / video if video else fresh)
+        files = {name: [s.st_size, s.st_mtime_ns] for name, _, s in walk(fresh)}
+        write_json(fresh / PROVENANCE, _provenance(project, wanted, files, planner.results))
+        _keep_foreign(target, fresh, before["files"])
+        retired = target.with_name(f".{target.name}-retired-{unique()}")
+        if target.exists():
+            os.rename(target, retired)
+        os.rename(fresh, target)
+        remove_tree(retired)
+    finally:
+        remove_tree(fresh)
 
 
 def _copy(source: Path, target: Path) -> None:

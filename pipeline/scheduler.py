@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 from pipeline.files import remove_tree, write_json
 from pipeline.graph import Node
+from pipeline.guard import needs_decision
 from pipeline.local import Job, Outcome, Tokens
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
 from pipeline.runs import RunFolder
@@ -45,6 +46,7 @@ class Report:
     blocked: dict[str, str] = field(default_factory=dict)
     not_started: list[str] = field(default_factory=list)
     warnings: dict[str, list[str]] = field(default_factory=dict)
+    undecided: list[Step] = field(default_factory=list)
     stopped_by: int | None = None
     seconds: float = 0.0
 
@@ -72,6 +74,7 @@ class Scheduler:
         self._waiting = [s.node for s in steps if s.status == WAIT]
         self._ready = [s.node for s in steps if s.status == RUN]
         self._jobs: dict[Node, Job] = {}
+        self._order = {node.label: i for i, node in enumerate(planner.graph.nodes)}
         self._signals = 0
         self._grace_s = planner.settings.execution.grace_s
         for step in steps:
@@ -81,7 +84,7 @@ class Scheduler:
     def run(self) -> Report:
         """Work until nothing is left to do, or until stopped."""
         clock = time.monotonic()
-        previous = {n: signal.signal(n, self._on_signal) for n in (signal.SIGINT, signal.SIGTERM)}
+        previous = {n: signal.signal(n, self._on_signal) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
         try:
             while self._jobs or ((self._ready or self._waiting) and not self._stopping()):
                 self._decide_waiting()
@@ -127,6 +130,10 @@ class Scheduler:
                 self._steps[node.label] = step
                 if step.status == HIT:
                     self._show_hit(step)
+                elif needs_decision(step, self.planner.forced, self.planner.settings.pipeline.guard_minutes):
+                    self.report.undecided.append(step)
+                    self.report.blocked[node.label] = "a decision"
+                    self._tell(node, {"event": "blocked", "text": "a decision"})
                 else:
                     self._ready.append(node)
 
@@ -143,12 +150,15 @@ class Scheduler:
     def _launch(self) -> None:
         if self._stopping():
             return
-        order = {node.label: i for i, node in enumerate(self.planner.graph.nodes)}
-        for node in sorted(self._ready, key=lambda n: order[n.label]):
+        busy = {self._key(n) for n in self._jobs}
+        for node in sorted(self._ready, key=lambda n: self._order[n.label]):
+            if self._key(node) in busy or self._made_meanwhile(node):
+                continue  # the same action under another video's name
             granted = self.tokens.take(node.info.cpus, node.info.gpus)
             if granted is None:
                 continue
             self._ready.remove(node)
+            busy.add(self._key(node))
             step = self._steps[node.label]
             if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
                 self.workspace.objects.set_aside(node.info.name, step.record.digest)
@@ -159,6 +169,20 @@ class Scheduler:
             write_json(attempt / "request.json", request)
             self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
             self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
+
+    def _made_meanwhile(self, node: Node) -> bool:
+        """Whether the result has appeared since the plan was made; then it is a hit."""
+        if node in self.planner.forced or not self.workspace.ledger.path(node.info.name, self._key(node)).exists():
+            return False
+        if self._steps[node.label].reasons[0].kind == "damaged":
+            return False
+        step = self.planner.decide(node)
+        if step.status != HIT:
+            return False
+        self._ready.remove(node)
+        self._steps[node.label] = step
+        self._show_hit(step)
+        return True
 
     def _request(self, step: Step, cpus: int, gpus: list[str]) -> dict[str, Any]:
         node, info = step.node, step.node.info
