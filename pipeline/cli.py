@@ -199,7 +199,9 @@ def main(argv: list[str] | None = None) -> int:
         parser = build_parser()
         args, unknown = parser.parse_known_args(rest)
         if unknown:
-            raise BadInput(f"unknown flag {unknown[0]!r} for {args.verb}", hint=_flag_hint(parser, args.verb, unknown[0]))
+            raise BadInput(
+                f"unknown flag {unknown[0]!r} for {args.verb}", hint=_flag_hint(parser, args.verb, unknown[0])
+            )
         module: Any = importlib.import_module(f"pipeline.commands.{_VERBS[args.verb][0]}")
         return int(getattr(module, f"{args.verb}_command")(args, options_of(args, overrides)))
     except PipelineError as error:

@@ -198,7 +198,12 @@ def _ask(folder: Path, references: list[str]) -> dict[str, Any]:
         target = Path(scratch) / "contracts.json"
         command = [sys.executable, "-P", "-m", "pipeline.describe", str(target), *references]
         child = subprocess.run(
-            command, env=child_environment(folder), cwd=scratch, stdin=subprocess.DEVNULL, capture_output=True, text=True
+            command,
+            env=child_environment(folder),
+            cwd=scratch,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
         )
         found = read_json(target)
     if not isinstance(found, dict):

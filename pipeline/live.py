@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,7 +57,9 @@ class Progress:
 class LiveDisplay:
     """Redraws a table on a terminal. `expected_s` is the time an action took before, by label."""
 
-    def __init__(self, steps: list[Step], expected_s: dict[str, float], cpus: int, console: Console | None = None) -> None:
+    def __init__(
+        self, steps: list[Step], expected_s: dict[str, float], cpus: int, console: Console | None = None
+    ) -> None:
         self._nodes = [s.node for s in steps]
         self._states = {s.node.label: self._first_word(s) for s in steps}
         self._expected_s, self._cpus = expected_s, cpus
@@ -111,9 +114,9 @@ class LiveDisplay:
     def _picture(self) -> Group:
         parts: list[Any] = [table_of(self._nodes, self._states)]
         for label, progress in self._running.items():
-            left = progress.seconds_left()
+            left, spent = progress.seconds_left(), time.monotonic() - progress.started
             words = [f"{label:<24}", progress_text(progress.event) if progress.event else "starting"]
-            words.append(f"{duration(left)} left" if left is not None else duration(time.monotonic() - progress.started))
+            words.append(f"{duration(left)} left" if left is not None else duration(spent))
             parts.append(Text("  ".join(words)))
         left = self._total_left()
         clock = duration(time.monotonic() - self._started)
@@ -139,7 +142,7 @@ class LiveDisplay:
         return total or None
 
 
-def table_of(nodes: list[Node], states: dict[str, str], extra: dict[str, tuple[str, ...]] | None = None) -> Table:
+def table_of(nodes: list[Node], states: dict[str, str], extra: Mapping[str, tuple[str, ...]] | None = None) -> Table:
     """Stages down, videos across (counts when there are many); `extra` are further columns by stage."""
     videos = list(dict.fromkeys(n.video.name for n in nodes if n.video))
     stages = list(dict.fromkeys(n.info.name for n in nodes))

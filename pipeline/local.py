@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -110,15 +111,22 @@ class Job:
 
     def poll(self) -> Outcome | None:
         """None while it runs. Kills it when the time to stop has passed."""
-        if self._process.poll() is None:
+        if not self._ended():
             if self._stop_by is not None and time.monotonic() > self._stop_by:
                 self.kill()
             return None
         self._sweep()
+        self._process.wait()
         value = read_json(self.attempt / "outcome.json")
         if isinstance(value, dict) and value.get("status") in ("done", "failed", "bad_input", "interrupted"):
             return Outcome(value["status"], value["message"], value["record"], tuple(value["warnings"]))
         return self._without_outcome(self._process.returncode)
+
+    def _ended(self) -> bool:
+        """Whether it has ended; it is not reaped, so that its session id stays its own until `_sweep` has been."""
+        if not hasattr(os, "waitid"):
+            return self._process.poll() is not None
+        return os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def _without_outcome(self, code: int) -> Outcome:
         if self._stop_by is not None or code in (ExitCode.INTERRUPTED, -signal.SIGTERM):
@@ -150,10 +158,8 @@ class Job:
         """End what the worker left behind in its session, and close our end of the pipe."""
         self._send(signal.SIGKILL, group=True)
         if self._process.stdin is not None:
-            try:
+            with contextlib.suppress(OSError):
                 self._process.stdin.close()
-            except OSError:
-                pass
 
     def _send(self, number: signal.Signals, *, group: bool) -> None:
         try:

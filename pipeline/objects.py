@@ -238,7 +238,8 @@ class Objects:
             if folder.is_symlink():
                 return None
             lines = [
-                f"{name}\0{s.st_mode & 0o170000}\0{s.st_size}\0{s.st_mtime_ns}\0{s.st_ctime_ns}" for name, _, s in walk(folder)
+                f"{name}\0{s.st_mode & 0o170000}\0{s.st_size}\0{s.st_mtime_ns}\0{s.st_ctime_ns}"
+                for name, _, s in walk(folder)
             ]
         except OSError:
             return None

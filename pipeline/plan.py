@@ -42,6 +42,7 @@ class Planner:
     ) -> None:
         self.workspace, self.graph, self.settings, self.sources = workspace, graph, settings, sources
         self.forced = set(forced or ())
+        self._per_video = {i.name for i in graph.definition.stages.values() if i.per_video}
         self.results: dict[str, Record] = {}
         """Label -> the record that stands for this node now."""
         self.steps: dict[str, Step] = {}
@@ -126,9 +127,7 @@ class Planner:
             digests = {v.name: self.sources.of(v.path) for v in videos}
             found["video"] = digests[node.video.name] if node.video else digests
         if "given" in node.info.takes:
-            beside = {
-                v.name: {s: self.sources.of(v.given[s]) for s in node.info.given if s in v.given} for v in videos
-            }
+            beside = {v.name: {s: self.sources.of(v.given[s]) for s in node.info.given if s in v.given} for v in videos}
             found["given"] = beside[node.video.name] if node.video else beside
         return found
 
@@ -143,7 +142,7 @@ class Planner:
         if earlier is None:
             return None, [Reason("never run")]
         assert node.info.code is not None
-        reasons = compare(wanted.text, node.info.code.modules, earlier, self._because)
+        reasons = compare(wanted.text, node.info.code.modules, earlier, self._because, self._per_video)
         return earlier, reasons or [Reason("never run")]
 
     def _expected(self, node: Node) -> tuple[list[Reason], Record | None]:
@@ -161,7 +160,7 @@ class Planner:
         earlier = nearest(text, self.workspace.ledger.all(info.name), node.video_name)
         if earlier is None:
             return [Reason("never run")], None
-        return compare(text, info.code.modules, earlier, self._because), earlier
+        return compare(text, info.code.modules, earlier, self._because, self._per_video), earlier
 
     def _because(self, stage: str, video: str | None, new: str | None, old: str | None) -> list[Reason]:
         """Why the folder of an input changed from digest `old` to `new`."""
@@ -175,4 +174,4 @@ class Planner:
         before = [r for r in self.workspace.ledger.all(stage) if r.digest == old and r.video == video]
         if now is None or not before:
             return []
-        return compare(now.action, now.modules, before[0], self._because)
+        return compare(now.action, now.modules, before[0], self._because, self._per_video)

@@ -5,7 +5,7 @@ Kinds form a closed list: never run, settings, input, code, version, salt, damag
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -84,28 +84,38 @@ def tree(reasons: list[Reason], indent: int = 2, seen: set[str] | None = None) -
 
 
 def nearest(text: dict[str, Any], records: list[Record], video: str | None) -> Record | None:
-    """The earlier result that differs in the fewest fields; the newest of equals (records come newest first)."""
+    """The earlier result that differs in the fewest fields; the newest of equals (records come newest first).
+
+    A video that was renamed finds its records by what they read.
+    """
     mine = [r for r in records if r.video == video]
+    if not mine and video is not None:
+        digests = {d for d in _flat(text.get("inputs", {})).values() if d is not None}
+        mine = [r for r in records if digests & set(_flat(r.action.get("inputs", {})).values())]
     return min(mine, key=lambda r: len(_differences(text, r.action)), default=None)
 
 
-def compare(wanted: dict[str, Any], modules: dict[str, str], earlier: Record, because: Because) -> list[Reason]:
-    """Every difference between the wanted text and an earlier record's."""
+def compare(
+    wanted: dict[str, Any], modules: dict[str, str], earlier: Record, because: Because, per_video: Collection[str] = ()
+) -> list[Reason]:
+    """Every difference between the wanted text and an earlier record's. `per_video` names the stages of one video."""
     reasons: list[Reason] = []
     for area, name, new, old in _differences(wanted, earlier.action):
         if area == "settings":
-            reasons.append(Reason("settings", name, _shown(old), _shown(new)))
+            reasons.append(Reason("settings", name, old, new))
         elif area == "inputs":
             stage, _, video = name.partition("/")
-            cause = because(stage, video or earlier.video, new, old) if old is not None and new is not None else []
-            if not cause and old is not None and new is not None:
-                cause = because(stage, None, new, old)
-            reasons.append(Reason("input", name, _shown(old), _shown(new), cause))
+            if not video and earlier.video and stage in per_video:
+                video = earlier.video
+            changed = old is not None and new is not None
+            cause = because(stage, video or None, new, old) if changed else []
+            label = f"{stage}/{video}" if video else stage
+            reasons.append(Reason("input", label, old, new, cause))
         elif area == "code":
-            changed = sorted(
+            files = sorted(
                 m for m in modules.keys() | earlier.modules.keys() if modules.get(m) != earlier.modules.get(m)
             )
-            reasons.append(Reason("code", ", ".join(changed[:3]) + (" …" if len(changed) > 3 else "")))
+            reasons.append(Reason("code", ", ".join(files[:3]) + (" …" if len(files) > 3 else "")))
         else:
             reasons.append(Reason("version" if area != "salt" else "salt", "", old, new))
     order = {k: i for i, k in enumerate(("settings", "version", "salt", "input", "code"))}
@@ -118,10 +128,6 @@ def show(value: Any) -> str:
         return f"file {str(value['file'])[:12]}"
     text = "none" if value is None else str(value) if value != "" else '""'
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _shown(value: Any) -> Any:
-    return value
 
 
 def _differences(new: dict[str, Any], old: dict[str, Any]) -> list[tuple[str, str, Any, Any]]:

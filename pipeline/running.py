@@ -86,7 +86,9 @@ class Run:
             done += 1
         self.tick(done, total if total is not None else done, label, _force=True)
 
-    def tick(self, done: float, total: float | None = None, label: str = "", _force: bool = False, **extra: Any) -> None:
+    def tick(
+        self, done: float, total: float | None = None, label: str = "", _force: bool = False, **extra: Any
+    ) -> None:
         """Report progress: `done` of `total`; `extra` are figures worth showing (``loss=0.3``). Never raises."""
         now = time.monotonic()
         if self._sink is None or (not _force and now - self._last_tick < _INTERVAL_S):

@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from types import FrameType
 from typing import Any, Protocol
 
@@ -17,9 +16,8 @@ from pipeline.graph import Node
 from pipeline.guard import needs_decision
 from pipeline.local import Job, Outcome, Tokens
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
+from pipeline.request import build_request
 from pipeline.runs import RunFolder
-from pipeline.settings import stage_values
-from pipeline.videos import VideoFile, state_of
 
 _POLL_S = 0.05
 
@@ -165,7 +163,7 @@ class Scheduler:
             cpus, gpus = granted
             attempt = self.workspace.tmp / f"try-{self.folder.id}-{secrets.token_hex(4)}"
             attempt.mkdir(parents=True)
-            request = self._request(step, cpus, gpus)
+            request = build_request(self.planner, step, self.folder.id, cpus, gpus)
             write_json(attempt / "request.json", request)
             self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
             self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
@@ -183,63 +181,6 @@ class Scheduler:
         self._steps[node.label] = step
         self._show_hit(step)
         return True
-
-    def _request(self, step: Step, cpus: int, gpus: list[str]) -> dict[str, Any]:
-        node, info = step.node, step.node.info
-        assert step.action is not None and info.code is not None
-        takes_sources = "video" in info.takes or "given" in info.takes
-        videos = [] if not takes_sources else [node.video] if node.video else self.planner.graph.videos
-        return {
-            "workspace": str(self.workspace.root),
-            "package_dir": str(self.planner.graph.definition.package_dir),
-            "reference": info.reference,
-            "data": list(info.data),
-            "label": node.label,
-            "stage": info.name,
-            "video": node.video_name,
-            "videos": [v.name for v in self.planner.graph.videos],
-            "key": step.action.key,
-            "action": step.action.text,
-            "modules": info.code.modules,
-            "settings": stage_values(self.planner.settings, info),
-            "inputs": self._folders(node),
-            "sources": [self._source(node, v) for v in videos],
-            "forced": node in self.planner.forced,
-            "run": self.folder.id,
-            "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
-            "device": "cuda" if gpus else "cpu",
-            "threads": cpus,
-            "grace_s": self._grace_s,
-            "watch_parent": True,
-        }
-
-    def _folders(self, node: Node) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, nodes in self.planner.graph.inputs(node).items():
-            folders = {}
-            for source in nodes:
-                digest = self.planner.results[source.label].digest
-                folders[source.video_name or ""] = {
-                    "path": str(self.workspace.objects.path(name, digest)),
-                    "digest": digest,
-                }
-            by_video = node.video is None and bool(nodes) and nodes[0].video is not None
-            found[name] = {"folders": folders} if by_video else {"folder": next(iter(folders.values()))}
-        return found
-
-    def _source(self, node: Node, video: VideoFile) -> dict[str, Any]:
-        digests = self.planner.sources
-        given = {s: p for s, p in video.given.items() if s in node.info.given and "given" in node.info.takes}
-        read = [*given.values(), *([video.path] if "video" in node.info.takes else [])]
-        return {
-            "name": video.name,
-            "path": str(video.path),
-            "digest": digests.of(video.path) if "video" in node.info.takes else "",
-            "is_folder": video.is_folder,
-            "given": {s: str(p) for s, p in given.items()},
-            "given_digests": {s: digests.of(p) for s, p in given.items()},
-            "states": {str(p): state_of(p) for p in read},
-        }
 
     # ------------------------------------------------------------------ collecting
 
@@ -327,4 +268,3 @@ class Scheduler:
     def _ask_all_to_stop(self) -> None:
         for job in self._jobs.values():
             job.ask_to_stop(self._grace_s)
-

@@ -62,7 +62,7 @@ class Settings:
     @property
     def pipeline(self) -> PipelineSection:
         """The ``[pipeline]`` table."""
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in self.values["pipeline"].items()}
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in self.values["pipeline"].items()}
         return PipelineSection(**values)
 
     @property
@@ -181,9 +181,9 @@ def coerce(kind: dict[str, Any], value: Any, where: str, base: Path) -> Any:
         return None if value is None or value == "none" else coerce(kind["item"], value, where, base)
     if name == "bool" and isinstance(value, bool):
         return value
-    if name == "int" and not isinstance(value, bool):
-        if isinstance(value, int) or (isinstance(value, float) and value.is_integer()):
-            return int(value)
+    whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    if name == "int" and whole and not isinstance(value, bool):
+        return int(value)
     if name == "float" and isinstance(value, int | float) and not isinstance(value, bool):
         number = float(value)
         if number == number and abs(number) != float("inf"):

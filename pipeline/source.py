@@ -39,8 +39,9 @@ class CodeReader:
         self.package = package_dir.name
         self._memo_path = memo
         stored = read_json(memo) if memo else None
-        usable = isinstance(stored, dict) and stored.get("format") == _MEMO_FORMAT
-        self._memo: dict[str, Any] = stored.get("files", {}) if usable else {}
+        self._memo: dict[str, Any] = {}
+        if isinstance(stored, dict) and stored.get("format") == _MEMO_FORMAT:
+            self._memo = stored.get("files", {})
         self._dirty = False
         self._seen: dict[Path, tuple[str, list[str]]] = {}
 

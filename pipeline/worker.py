@@ -195,7 +195,8 @@ class Worker:
             v["name"]: Source(Path(v["path"]), v["name"], v["digest"], v["is_folder"]) for v in request["sources"]
         }
         given = {
-            v["name"]: Given({s: Path(p) for s, p in v["given"].items()}, v["given_digests"]) for v in request["sources"]
+            v["name"]: Given({s: Path(p) for s, p in v["given"].items()}, v["given_digests"])
+            for v in request["sources"]
         }
         only = request["video"]
         if sources:
@@ -222,7 +223,9 @@ class Worker:
                 except OSError:
                     now = []
                 if now != before:
-                    raise BadInput("it changed while it was being read", where=path, hint="run again when it is complete")
+                    raise BadInput(
+                        "it changed while it was being read", where=path, hint="run again when it is complete"
+                    )
 
     # ------------------------------------------------------------------ stopping
 

@@ -63,7 +63,9 @@ class Workspace:
             return workspace
         if not create:
             raise BadInput(
-                "no workspace here", where=workspace.root, hint="`banmo run VIDEOS` makes one, or name it by --workspace"
+                "no workspace here",
+                where=workspace.root,
+                hint="`banmo run VIDEOS` makes one, or name it by --workspace",
             )
         workspace.create()
         return workspace
