@@ -100,7 +100,8 @@ def export_model(
 ) -> None:
     """Write the whole folder for a model whose videos are `inputs`, in the model's order."""
     times = [video.clip.source_time_s for video in inputs]
-    rig = build_rig(model, times, settings.resolution, settings.faces)
+    kept = max(1, settings.influences)
+    rig = build_rig(model, times, settings.resolution, settings.faces, sorted({4, 8, kept}))
     run.log.info("surface: %d faces, %d joints", len(rig.mesh.faces), len(rig.skeleton))
     colours = [surface_colour(model, rig, k) for k in range(len(inputs))]
     colour = np.mean(colours, axis=0)
@@ -133,7 +134,7 @@ def export_model(
     report = quality.report(rig.mesh, rig.normals, rig.facts, figures, views, pose_summary)
     formats.write_json(out / "quality.json", report)
 
-    joint_idx, weight = rig.skin(settings.influences)
+    joint_idx, weight = rig.joint_skin(kept)
     mesh = gltf.RiggedMesh("model", rig.mesh.vertices, rig.normals, rig.mesh.faces, colour, joint_idx, weight)
     extras = {"length": rig.mesh.length, "trust": report["trust"], "verdict": report["verdict"]}
     (out / "model.glb").write_bytes(gltf.write_glb(mesh, rig.skeleton, motions, extras))

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from stages.geometry.raster import vertex_normals
-from stages.meshing.skeleton import Skeleton, blend, build_skeleton, nearest_rigid, top_influences
+from stages.meshing.skeleton import Skeleton, build_skeleton, nearest_rigid
+from stages.meshing.skinning import blend, fit_influences
 from stages.meshing.surface import EmptySurface, Mesh, SurfaceFacts, clean_surface, evaluate, extract
 
 _POINTS_PER_WARP = 150_000
+_FIT_FRAMES = 150  # of all clips together, to fit the skin to
 
 
 class Animatable(Protocol):
@@ -71,17 +73,22 @@ class Animatable(Protocol):
 
 @dataclass(frozen=True)
 class Rig:
-    """The model at rest: surface, normals (V, 3), weights (V, B) in the model's bone order, joints."""
+    """The model at rest: surface, normals (V, 3), joints, and skins by number of influences.
+
+    weights: (V, B), the model's own, in the model's bone order. skins: influences -> bone indices and weights (V, K).
+    """
 
     mesh: Mesh
     normals: np.ndarray
     weights: np.ndarray
     skeleton: Skeleton
     facts: SurfaceFacts
+    skins: dict[int, tuple[np.ndarray, np.ndarray]]
 
-    def skin(self, influences: int) -> tuple[np.ndarray, np.ndarray]:
-        """Joint indices and weights (V, K) of the largest influences, joint order."""
-        return top_influences(self.weights[:, self.skeleton.bone], influences)
+    def joint_skin(self, influences: int) -> tuple[np.ndarray, np.ndarray]:
+        """Joint (not bone) indices and weights (V, K), descending; index 0 where the weight is 0."""
+        bone, weight = self.skins[influences]
+        return np.where(weight > 0, self.skeleton.joint_of_bone()[bone], 0), weight
 
 
 @dataclass(frozen=True)
@@ -113,41 +120,43 @@ def surface_of(model: Animatable, resolution: int, face_budget: int) -> tuple[Me
         return clean_surface(extract(model.sdf, bounds, min(resolution, 64), level), face_budget, level)
 
 
-def build_rig(model: Animatable, clip_times_s: Sequence[np.ndarray], resolution: int, face_budget: int) -> Rig:
+def build_rig(
+    model: Animatable,
+    clip_times_s: Sequence[np.ndarray],
+    resolution: int,
+    face_budget: int,
+    influences: Sequence[int] = (8, 4),
+) -> Rig:
     """Extract the surface and join the bones.
 
     Args:
         clip_times_s: times in seconds of each video, in the model's order.
         resolution: cells along the longest edge of the object's box.
         face_budget: faces to keep.
+        influences: the numbers of influences to make skins for.
     """
     mesh, facts = surface_of(model, resolution, face_budget)
     weights = model.rest_weights(_points(mesh.vertices)).cpu().numpy().astype(np.float64)
     weights = np.clip(weights, 0, None)
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-    motion = [_bone_motion(model, k, times) for k, times in enumerate(clip_times_s)]
-    skeleton = build_skeleton(
-        model.bone_centres.cpu().numpy(),
-        np.concatenate(motion),
-        weights,
-        mesh.vertices,
-    )
-    return Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts)
+    samples = [times[:: max(1, -(-len(times) * len(clip_times_s) // _FIT_FRAMES))] for times in clip_times_s]
+    motion = np.concatenate([_bone_motion(model, k, times) for k, times in enumerate(samples)])
+    posed = np.concatenate([_warp(model, mesh.vertices, k, times) for k, times in enumerate(samples)])
+
+    def inside(points: np.ndarray) -> np.ndarray:
+        return evaluate(model.sdf, points) < facts.level
+
+    skeleton = build_skeleton(model.bone_centres.cpu().numpy(), motion, weights, mesh.vertices, inside)
+    skins = {k: fit_influences(mesh.vertices, weights, motion, posed, k, mesh.length) for k in influences}
+    return Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts, skins)
 
 
 def pose_clip(model: Animatable, rig: Rig, video_idx: int, time_s: np.ndarray) -> PosedClip:
     """The rig at times (T,) in seconds of one video."""
-    points = _points(rig.mesh.vertices)
-    per_pass = max(1, _POINTS_PER_WARP // len(points))
-    warped = [
-        model.forward_warp(points, video_idx, _seconds(time_s[i : i + per_pass])).cpu().numpy()
-        for i in range(0, len(time_s), per_pass)
-    ]
-    vertices = np.concatenate(warped).astype(np.float32)
+    vertices = _warp(model, rig.mesh.vertices, video_idx, time_s)
     transforms = nearest_rigid(_bone_motion(model, video_idx, time_s))
     error = {}
-    for influences in (8, 4):
-        index, weight = top_influences(rig.weights, influences)
+    for influences, (index, weight) in rig.skins.items():
         worst = [
             np.linalg.norm(blend(rig.mesh.vertices, transforms[t : t + 1], index, weight) - vertices[t], axis=-1).max()
             for t in range(len(time_s))
@@ -167,6 +176,16 @@ def surface_colour(model: Animatable, rig: Rig, video_idx: int) -> np.ndarray:
     points = _points(rig.mesh.vertices)
     moments = [model.colour(points, video_idx, time).cpu().numpy() for time in (-0.5, 0.0, 0.5)]
     return np.clip(np.mean(moments, axis=0, dtype=np.float64), 0, 1)
+
+
+def _warp(model: Animatable, vertices: np.ndarray, video_idx: int, time_s: np.ndarray) -> np.ndarray:
+    points = _points(vertices)
+    per_pass = max(1, _POINTS_PER_WARP // len(points))
+    parts = [
+        model.forward_warp(points, video_idx, _seconds(time_s[i : i + per_pass])).cpu().numpy()
+        for i in range(0, len(time_s), per_pass)
+    ]
+    return np.concatenate(parts).astype(np.float32)
 
 
 def _bone_motion(model: Animatable, video_idx: int, time_s: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A tree of joints from loose bones, by what stays together in motion and lies close at rest; and skin weights for it.
+"""A tree of joints from loose bones, by what stays together in motion and lies close at rest.
 
 Bones in the model are independent Gaussians, each with its own rigid motion. A rig is a tree. The cost of joining two
 bones is how badly the best common joint between them holds over all frames, plus how far they lie apart at rest; the
@@ -7,6 +7,7 @@ tree is the one of least total cost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,7 +118,11 @@ def pair_joints(centres: np.ndarray, transforms: np.ndarray, length: float) -> t
 
 
 def build_skeleton(
-    centres: np.ndarray, transforms: np.ndarray, weights: np.ndarray, vertices: np.ndarray
+    centres: np.ndarray,
+    transforms: np.ndarray,
+    weights: np.ndarray,
+    vertices: np.ndarray,
+    inside: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Skeleton:
     """Join the model's bones into a tree.
 
@@ -128,6 +133,7 @@ def build_skeleton(
         transforms: (T, B, 4, 4) canonical to posed, over all clips.
         weights: (V, B) skinning weights at rest.
         vertices: (V, 3) surface at rest.
+        inside: tells which of points (N, 3) lie in the body; joints outside are drawn in between their bones.
     """
     centres = centres.astype(np.float64)
     count = len(centres)
@@ -146,37 +152,9 @@ def build_skeleton(
     parent = np.where(before[order] < 0, -1, position[parent_bone])
     rest = np.tile(np.eye(4), (count, 1, 1))
     rest[:, :3, 3] = point[order, parent_bone]
+    middle = (centres[order] + centres[parent_bone]) / 2
+    for _ in range(3 if inside is not None else 0):
+        outside = ~inside(rest[:, :3, 3])
+        rest[outside, :3, 3] = (rest[outside, :3, 3] + middle[outside]) / 2
     names = [f"bone_{int(b):02d}" for b in order]
     return Skeleton(names, order.astype(np.int64), parent.astype(np.int64), rest, centres[order])
-
-
-def top_influences(weights: np.ndarray, influences: int) -> tuple[np.ndarray, np.ndarray]:
-    """The largest weights of each vertex, descending and made to sum to one in float32.
-
-    Args:
-        weights: (V, B), rows sum to one.
-        influences: how many to keep.
-
-    Returns:
-        Column indices (V, K) int64 and weights (V, K) float32 with K = min(influences, B); index 0 where weight is 0.
-    """
-    kept = min(influences, weights.shape[1])
-    index = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
-    value = np.take_along_axis(weights, index, axis=1).astype(np.float64)
-    value[value < 1e-4 * value[:, :1]] = 0.0
-    value = (value / value.sum(axis=1, keepdims=True)).astype(np.float32)
-    value[:, 0] += (1.0 - value.astype(np.float64).sum(axis=1)).astype(np.float32)
-    return np.where(value > 0, index, 0), value
-
-
-def blend(vertices: np.ndarray, transforms: np.ndarray, index: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Linear blend skinning (T, V, 3): ``sum_k weight_k J_index_k x``.
-
-    Args:
-        vertices: (V, 3); transforms: (T, B, 4, 4) canonical to posed; index, weight: (V, K).
-    """
-    rows = np.repeat(np.arange(len(vertices)), index.shape[1])
-    matrix = sparse.csr_matrix((weight.ravel(), (rows, index.ravel())), shape=(len(vertices), transforms.shape[1]))
-    homogeneous = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
-    blended = np.stack([(matrix @ t.reshape(len(t), 16)).reshape(-1, 4, 4)[:, :3] for t in transforms])
-    return np.einsum("tvij,vj->tvi", blended, homogeneous)

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.meshing.skeleton import blend, build_skeleton, invert, nearest_rigid, pair_joints, top_influences
+from stages.meshing.skeleton import build_skeleton, invert, nearest_rigid, pair_joints
+from stages.meshing.skinning import blend, fit_influences, top_influences
 
 
 def turn_about(point: np.ndarray, rotation: Rotation) -> np.ndarray:
@@ -116,6 +117,43 @@ def test_blending_equals_a_loop() -> None:
         for v in range(20):
             slow = sum(weights[v, b] * (transforms[t, b] @ np.append(vertices[v], 1))[:3] for b in range(7))
             np.testing.assert_allclose(moved[t, v], slow, atol=1e-3)
+
+
+def test_fitted_influences_follow_better_and_stay_weights() -> None:
+    rng = np.random.default_rng(0)
+    _, transforms, _ = star(30, 11)
+    vertices = 0.4 * rng.normal(size=(60, 3))
+    weights = rng.dirichlet(np.full(7, 1.0), 60)
+    posed = blend(vertices, transforms, *top_influences(weights, 7))
+    for kept in (2, 4):
+        plain = blend(vertices, transforms, *top_influences(weights, kept))
+        index, value = fit_influences(vertices, weights, transforms, posed, kept, 2.0)
+        fitted = blend(vertices, transforms, index, value)
+        assert ((fitted - posed) ** 2).sum(axis=(0, 2)).mean() < 0.8 * ((plain - posed) ** 2).sum(axis=(0, 2)).mean()
+        assert (value >= 0).all() and (np.diff(value, axis=1) <= 1e-6).all()
+        np.testing.assert_allclose(value.astype(float).sum(axis=1), 1, atol=1e-6)
+        # No feasible step makes it better: shift a little weight between every pair of kept bones.
+        best = ((fitted - posed) ** 2).sum(axis=(0, 2))
+        for a in range(kept):
+            for b in range(kept):
+                moved = value.astype(float).copy()
+                step = np.minimum(0.02, moved[:, a])
+                moved[:, a] -= step
+                moved[:, b] += step
+                other = ((blend(vertices, transforms, index, moved) - posed) ** 2).sum(axis=(0, 2))
+                real = (value > 0).all(axis=1)
+                assert (best[real] <= other[real] + 1e-4).all()
+
+
+def test_weights_that_motion_cannot_tell_apart_stay_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    vertices, weights = rng.normal(size=(20, 3)), rng.dirichlet(np.ones(5), 20)
+    still = np.tile(np.eye(4), (6, 5, 1, 1))
+    index, value = fit_influences(vertices, weights, still, np.tile(vertices, (6, 1, 1)), 4, 2.0)
+    plain_index, _ = top_influences(weights, 4)
+    np.testing.assert_array_equal(index, plain_index)
+    own = np.take_along_axis(weights, index, axis=1)
+    np.testing.assert_allclose(value, own + (1 - own.sum(axis=1, keepdims=True)) / 4, atol=1e-6)
 
 
 def test_the_nearest_rigid_transform_undoes_noise_and_never_mirrors() -> None:
