@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from pathlib import Path
@@ -14,15 +15,13 @@ class EventWriter:
     def __init__(self, path: Path, common: dict[str, Any] | None = None) -> None:
         self._common = common or {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(path, "ab", buffering=0)  # noqa: SIM115  (lives as long as the process)
+        self._file = path.open("ab", buffering=0)
 
     def __call__(self, event: dict[str, Any]) -> None:
         """Append one event."""
         value = {"time": round(time.time(), 3), **self._common, **event}
-        try:
+        with contextlib.suppress(OSError, ValueError, TypeError):
             self._file.write((json.dumps(value, ensure_ascii=True) + "\n").encode())
-        except (OSError, ValueError, TypeError):
-            pass
 
     def close(self) -> None:
         """Close the file."""
@@ -39,7 +38,7 @@ class EventReader:
     def read(self) -> list[dict[str, Any]]:
         """The events appended since the last call; lines that are not JSON are skipped."""
         try:
-            with open(self._path, "rb") as file:
+            with self._path.open("rb") as file:
                 file.seek(self._offset)
                 data = file.read()
         except OSError:

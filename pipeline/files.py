@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -32,7 +33,7 @@ def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name[:80]}.{secrets.token_hex(4)}.tmp")
     try:
-        with open(temporary, "w", encoding="utf-8") as file:
+        with temporary.open("w", encoding="utf-8") as file:
             file.write(text)
             if durable:
                 file.flush()
@@ -75,7 +76,7 @@ def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
 def sha256_file(path: Path) -> str:
     """SHA-256 of a file's content."""
     digest = hashlib.sha256()
-    with open(path, "rb", buffering=0) as file:
+    with path.open("rb", buffering=0) as file:
         while chunk := file.read(CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
@@ -96,10 +97,8 @@ def remove_tree(path: Path) -> None:
         path.unlink(missing_ok=True)
         return
     for folder, _, _ in os.walk(path):
-        try:
+        with contextlib.suppress(OSError):
             os.chmod(folder, 0o755)
-        except OSError:
-            pass
     shutil.rmtree(path, ignore_errors=True)
 
 

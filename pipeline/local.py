@@ -93,7 +93,7 @@ class Job:
             environment[name] = str(cpus)
         environment["CUDA_VISIBLE_DEVICES"] = ",".join(gpus)
         log_path.parent.mkdir(parents=True, exist_ok=True)
-        with open(log_path, "ab") as log:
+        with log_path.open("ab") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "pipeline.worker", str(attempt / "request.json")],
                 stdin=subprocess.PIPE,

@@ -10,6 +10,7 @@ A small memo of file times (``cache/seen``) tells when a folder must be hashed a
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -250,10 +251,8 @@ class Objects:
 def _drop_empty_folders(folder: Path) -> None:
     for current, _, _ in os.walk(folder, topdown=False):
         if Path(current) != folder:
-            try:
+            with contextlib.suppress(OSError):  # not empty
                 os.rmdir(current)
-            except OSError:
-                pass  # not empty
 
 
 def _make_read_only(folder: Path) -> None:

@@ -189,7 +189,7 @@ def _newest_log(project: Project, node: Node) -> Path | None:
 
 
 def _follow(path: Path) -> None:
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         file.seek(0, 2)
         while True:
             text = file.read()
