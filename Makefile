@@ -8,7 +8,6 @@
 PY        ?= python3
 VENV      ?= .venv
 TORCH     ?= torch==2.13.0
-# Where pip is told to look for anything else, or how: PIP="... -q"
 PIP       ?= "$(VENV)/bin/python" -m pip --disable-pip-version-check
 
 VIDEOS    ?=
@@ -17,6 +16,10 @@ PRESET    ?=
 STAGE     ?=
 VIDEO     ?=
 ARGS      ?=
+# Evaluation data and script of your own; see benchmarks/
+DATA      ?=
+LOOK      ?= clean
+EVALUATE  ?=
 
 # On a CPU shared with others, OpenMP threads that spin while they wait make torch many times slower.
 export GOMP_SPINCOUNT ?= 2000
@@ -31,7 +34,7 @@ empty  :=
 space  := $(empty) $(empty)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reconstruct stage status why inspect report view verify samples test soak lint bench docs clean
+.PHONY: help setup reconstruct stage status why inspect verify samples test soak lint bench score docs clean
 
 help:  ## this list
 	@awk -F ':.*##' '/^[a-z-]+:.*##/ {printf "  make %-12s %s\n", $$1, $$2}' Makefile
@@ -83,6 +86,16 @@ soak: $(STAMP)  ## kill the pipeline at 20 random moments and compare with an un
 lint: $(STAMP)  ## style
 	$(PYTHON) -m ruff check .
 	$(VENV)/bin/lint-imports
+
+bench: $(STAMP)  ## reconstruct DATA (given masks and root poses) and score it with EVALUATE
+	@test -n "$(DATA)" -a -n "$(EVALUATE)" || { echo "say which: make bench DATA=data/fox EVALUATE=evaluate.py [LOOK=clean]"; exit 2; }
+	$(PYTHON) -m benchmarks.tier_a --data "$(DATA)" --look "$(LOOK)" --out "build/bench/$(notdir $(DATA:/=))-$(LOOK)"
+	$(BANMO) run "build/bench/$(notdir $(DATA:/=))-$(LOOK)" --workspace "build/bench/$(notdir $(DATA:/=))-$(LOOK)-workspace" $(if $(PRESET),--preset "$(PRESET)") $(ARGS)
+	$(PYTHON) -m benchmarks.score --evaluate "$(EVALUATE)" --data "$(DATA)" --look "$(LOOK)" --workspace "build/bench/$(notdir $(DATA:/=))-$(LOOK)-workspace"
+
+score: $(STAMP)  ## score WORKSPACE against DATA with EVALUATE
+	@test -n "$(DATA)" -a -n "$(EVALUATE)" || { echo "say which: make score DATA=data/fox EVALUATE=evaluate.py [LOOK=clean]"; exit 2; }
+	$(PYTHON) -m benchmarks.score --evaluate "$(EVALUATE)" --data "$(DATA)" --look "$(LOOK)" --workspace "$(WORKSPACE)"
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code
 	$(PYTHON) docs/generate.py

@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.score --evaluate evaluate.py --data DATA/fox --look clean --workspace WORKSPACE [--only mesh]``
 
-Runs ``evaluate.py mesh`` on ``exports/meshes``, ``pose`` on ``exports/cameras``, and for each clip ``mask`` and ``flow``
-on the last run's folders, as far as they exist. Prints what the script prints; exit 1 if one of them failed.
+Runs ``evaluate.py mesh`` on ``exports/meshes``, ``pose`` on ``exports/cameras``, and a clip ``mask`` and ``flow`` on
+the last run's folders, as far as they exist. Prints what the script prints; exit 1 if one of them failed.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ def commands(
     return wanted
 
 
-def main(evaluate: Path, data: Path, workspace: Path = Path("workspace"), look: str = "clean", only: Part = "all") -> None:
+def main(
+    evaluate: Path, data: Path, workspace: Path = Path("workspace"), look: str = "clean", only: Part = "all"
+) -> None:
     """Score a workspace's exports against an evaluation data set.
 
     Args:

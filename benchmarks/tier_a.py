@@ -21,7 +21,11 @@ log = logging.getLogger(__name__)
 
 
 def place(
-    data: Path, look: str, out: Path, without: Literal["nothing", "masks", "poses", "both"] = "nothing", copy: bool = False
+    data: Path,
+    look: str,
+    out: Path,
+    without: Literal["nothing", "masks", "poses", "both"] = "nothing",
+    copy: bool = False,
 ) -> list[Path]:
     """Fill `out`; returns what was put there. Raises FileNotFoundError naming what the data set lacks."""
     videos = sorted((data / look / "videos").glob("*.mp4"))

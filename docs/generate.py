@@ -14,7 +14,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from pipeline import definition, settings  # noqa: E402
+from pipeline import definition, settings
 
 HEAD = """\
 # Settings of this workspace. Every line that is commented out shows a default; take away the "#" and change it.
@@ -74,8 +74,8 @@ def page() -> str:
     out = [
         "# Settings",
         "",
-        "Written from the code by `make docs`. In `pipeline.toml` a section is a table; on the command line a setting is",
-        "`--section.key value`. Precedence: defaults, preset, `pipeline.toml`, command line.",
+        "Written from the code by `make docs`. In `pipeline.toml` a section is a table; on the command line a setting",
+        "is `--section.key value`. Precedence: defaults, preset, `pipeline.toml`, command line.",
     ]
     for section, about, fields in tables():
         out += ["", f"## {section}", "", " ".join(about.split("\n\n")[0].split())]

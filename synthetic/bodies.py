@@ -60,8 +60,8 @@ class QuadrupedShape:
 
 
 CAT = QuadrupedShape(
-    leg=0.6, chest=0.21, belly=0.185, haunch=0.17, neck=0.25, neck_girth=0.125, skull=0.15, muzzle=0.075, muzzle_girth=0.062,
-    ear=0.145,
+    leg=0.6, chest=0.21, belly=0.185, haunch=0.17, neck=0.25, neck_girth=0.125, skull=0.15, muzzle=0.075,
+    muzzle_girth=0.062, ear=0.145,
 )  # fmt: skip
 DOG = QuadrupedShape(
     leg=0.78, chest=0.215, belly=0.15, neck=0.36, neck_pitch_deg=48, skull=0.13, muzzle=0.2, muzzle_girth=0.075,
@@ -171,13 +171,45 @@ def _plan(s: QuadrupedShape) -> tuple[list[Bone], list[_Cone], dict[str, tuple[n
 
     side_axis = at(1, 0, 0)
     top = s.leg + 0.10  # the back's line of joints
-    pelvis, loin, chest, withers = at(0, top, -0.5), at(0, top + 0.015, -0.18), at(0, top, 0.14), at(0, top + 0.03, 0.46)
+    pelvis, loin, chest, withers = (
+        at(0, top, -0.5),
+        at(0, top + 0.015, -0.18),
+        at(0, top, 0.14),
+        at(0, top + 0.03, 0.46),
+    )
     bone("pelvis", None, pelvis, loin)
     bone("loin", "pelvis", loin, chest)
     bone("chest", "loin", chest, withers)
-    flesh("pelvis", pelvis + at(0, -0.035, 0.0), loin + at(0, -0.06, 0), s.haunch * 1.05, s.belly, 0.1, axis=side_axis, squeeze=0.9)
-    flesh("loin", loin + at(0, -0.07, 0), chest + at(0, -0.08, 0), s.belly, s.chest * 0.97, 0.1, axis=side_axis, squeeze=0.88)
-    flesh("chest", chest + at(0, -0.085, 0), withers + at(0, -0.1, -0.05), s.chest, s.chest * 0.86, 0.1, axis=side_axis, squeeze=0.84)
+    flesh(
+        "pelvis",
+        pelvis + at(0, -0.035, 0.0),
+        loin + at(0, -0.06, 0),
+        s.haunch * 1.05,
+        s.belly,
+        0.1,
+        axis=side_axis,
+        squeeze=0.9,
+    )
+    flesh(
+        "loin",
+        loin + at(0, -0.07, 0),
+        chest + at(0, -0.08, 0),
+        s.belly,
+        s.chest * 0.97,
+        0.1,
+        axis=side_axis,
+        squeeze=0.88,
+    )
+    flesh(
+        "chest",
+        chest + at(0, -0.085, 0),
+        withers + at(0, -0.1, -0.05),
+        s.chest,
+        s.chest * 0.86,
+        0.1,
+        axis=side_axis,
+        squeeze=0.84,
+    )
 
     up = np.deg2rad(s.neck_pitch_deg)
     head = withers + s.neck * at(0, np.sin(up), np.cos(up))

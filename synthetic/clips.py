@@ -149,7 +149,13 @@ def write_truth(folder: Path, made: Film) -> None:
 
 
 def write_clips(
-    folder: Path, clips: int = 3, frames: int = 40, size: int = 192, seed: int = 0, truth: bool = False, kind: str = "cat"
+    folder: Path,
+    clips: int = 3,
+    frames: int = 40,
+    size: int = 192,
+    seed: int = 0,
+    truth: bool = False,
+    kind: str = "cat",
 ) -> list[Film]:
     """Film and write sample clips; returns them with their truth."""
     folder.mkdir(parents=True, exist_ok=True)

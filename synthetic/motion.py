@@ -51,7 +51,9 @@ def improvise(rng: np.random.Generator, duration_s: float) -> Performance:
     turn = np.cumsum(rng.normal(0, 0.12, count) + rng.choice([-1, 1]) * 0.16) * 0.5
     yaw = _wander(rng, count, 0.75) * (1.0 - 0.6 * walk)
     pitch = 0.12 + _wander(rng, count, 0.28) * (1.0 - 0.5 * walk)
-    return Performance(knots, walk, turn, yaw, pitch, stride_s=float(rng.uniform(0.85, 1.1)), energy=float(rng.uniform(0.8, 1.2)))
+    return Performance(
+        knots, walk, turn, yaw, pitch, stride_s=float(rng.uniform(0.85, 1.1)), energy=float(rng.uniform(0.8, 1.2))
+    )
 
 
 def perform(body: Body, performance: Performance, times_s: np.ndarray) -> Motion:
@@ -84,8 +86,12 @@ def _pose(
     turn: dict[str, np.ndarray] = {}  # bone -> rotation vector about its joint
     sway, amount = np.sin(cycle), walk * energy
     breath = np.sin(2 * np.pi * t / 2.6)
-    turn["pelvis"] = np.array([0.03 * np.sin(2 * cycle + 0.6) * amount, 0.10 * sway * amount, 0.05 * np.sin(cycle + 0.5) * amount])
-    turn["loin"] = np.array([-0.045 * np.sin(2 * cycle + 0.6) * amount + 0.01 * breath, -0.11 * sway * amount + 0.10 * yaw, 0.0])
+    turn["pelvis"] = np.array(
+        [0.03 * np.sin(2 * cycle + 0.6) * amount, 0.10 * sway * amount, 0.05 * np.sin(cycle + 0.5) * amount]
+    )
+    turn["loin"] = np.array(
+        [-0.045 * np.sin(2 * cycle + 0.6) * amount + 0.01 * breath, -0.11 * sway * amount + 0.10 * yaw, 0.0]
+    )
     turn["chest"] = np.array([0.012 * breath, -0.07 * sway * amount + 0.12 * yaw, -0.05 * np.sin(cycle + 0.5) * amount])
     nod = 0.05 * np.sin(2 * cycle + 1.0) * amount
     turn["neck"] = np.array([0.35 * pitch + nod, 0.30 * yaw + 0.05 * sway * amount, 0.0])

@@ -139,7 +139,7 @@ def flow_between(
         points = posed @ pose[:3, :3].T + pose[:3, 3]
         return points, rasterise(points, body.faces, intrinsics, *size_px)
 
-    before, fragments = seen(posed_from, camera_from_object_from)
+    _before, fragments = seen(posed_from, camera_from_object_from)
     after, later = seen(posed_to, camera_from_object_to)
     rows, columns = np.nonzero(fragments.covered)
     corners = body.faces[fragments.face_idx[rows, columns]]

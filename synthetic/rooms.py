@@ -232,8 +232,9 @@ def _wall(rng: np.random.Generator, width: float, height: float, tint: np.ndarra
     elif kind == "motif":
         period = int(TEXELS_PER_UNIT * rng.uniform(0.35, 0.6))
         rows = np.arange(h)
-        dots = ((rows[:, None] % period - period / 2) ** 2 + ((columns[None] + (rows[:, None] // period) % 2 * period // 2)
-                % period - period / 2) ** 2) < (period * 0.22) ** 2  # fmt: skip
+        shift = (rows[:, None] // period) % 2 * period // 2  # every other row half a step aside
+        dy, dx = rows[:, None] % period - period / 2, (columns[None] + shift) % period - period / 2
+        dots = dy**2 + dx**2 < (period * 0.22) ** 2
         image = np.where(dots[..., None], image * _pastel(rng), image)
     image *= (1 + 0.03 * _grain(rng, h, w, 3) + 0.05 * _grain(rng, h, w, 60))[..., None]
     image[h - int(0.2 * TEXELS_PER_UNIT) :] = np.array([0.85, 0.84, 0.8])  # skirting board

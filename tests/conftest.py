@@ -8,7 +8,7 @@ from pathlib import Path
 # Before torch is imported anywhere: threads that spin while they wait starve their neighbours on a busy machine.
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
-import pytest  # noqa: E402
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 

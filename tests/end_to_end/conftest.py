@@ -47,7 +47,11 @@ def environment() -> dict[str, str]:
 
 
 def run_banmo(
-    *words: object, code: Path = ROOT, python: tuple[str, ...] = (), before: tuple[str, ...] = (), timeout_s: float = 600.0
+    *words: object,
+    code: Path = ROOT,
+    python: tuple[str, ...] = (),
+    before: tuple[str, ...] = (),
+    timeout_s: float = 600.0,
 ) -> Outcome:
     """Run ``banmo`` with the code in `code`, as a user would; `python` are options of the interpreter."""
     command = [*before, sys.executable, *python, "-m", "pipeline.cli", *map(str, words)]

@@ -1,4 +1,4 @@
-"""Every kind of bad input: exit code 2, one clear sentence, nothing half done in the store, the user's files untouched."""
+"""Every kind of bad input: exit code 2, one clear sentence, nothing half done in the store, no file touched."""
 
 from __future__ import annotations
 
@@ -88,7 +88,9 @@ def test_folder_without_videos(videos: Path, workspace: Path, untouched: Watch) 
     refused(run(videos, workspace), "videos")
 
 
-@pytest.mark.parametrize("content", [b"", b"this is a text, not a film\n" * 50, bytes(5000)], ids=["empty", "text", "zeros"])
+@pytest.mark.parametrize(
+    "content", [b"", b"this is a text, not a film\n" * 50, bytes(5000)], ids=["empty", "text", "zeros"]
+)
 def test_not_a_video(videos: Path, workspace: Path, untouched: Watch, content: bytes) -> None:
     (videos / "cat.mp4").write_bytes(content)
     untouched(videos)
@@ -176,7 +178,9 @@ def test_same_name_twice(videos: Path, workspace: Path, untouched: Watch) -> Non
     assert not (workspace / "objects").exists() or not list((workspace / "objects").iterdir())
 
 
-@pytest.mark.parametrize("name", ["two words", "katze-äöü-猫", "-rf", "line\nbreak", "..", "a..b", "$(touch x);&", "'quoted\""])
+@pytest.mark.parametrize(
+    "name", ["two words", "katze-äöü-猫", "-rf", "line\nbreak", "..", "a..b", "$(touch x);&", "'quoted\""]
+)
 def test_odd_names_work_and_stay_inside(tmp_path: Path, contracts: Path, name: str) -> None:
     """A clip may be called anything; its results lie inside the workspace and lines of output stay lines."""
     videos, workspace = tmp_path / "odd videos", tmp_path / "work space"

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
@@ -35,10 +36,8 @@ def kill_all(run: subprocess.Popen[bytes]) -> None:
         doomed = psutil.Process(run.pid).children(recursive=True)
     except psutil.NoSuchProcess:
         doomed = []
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(run.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     for process in doomed:
         try:
             process.kill()
@@ -75,7 +74,9 @@ def test_killed_runs_end_as_undisturbed_ones(finished: tuple[Path, Outcome], cli
         ended = run_banmo("run", clips, "--workspace", workspace, *TINY)
         assert ended.code == 0, ended.text
         assert view(workspace) == reference, f"after {killed - before} kills (BANMO_SOAK_SEED={SEED})"
-        assert (workspace / "exports" / "model.glb").read_bytes() == (finished[0] / "exports" / "model.glb").read_bytes()
+        assert (workspace / "exports" / "model.glb").read_bytes() == (
+            finished[0] / "exports" / "model.glb"
+        ).read_bytes()
         assert run_banmo("verify", "--deep", "--workspace", workspace).code == 0
         assert not list((workspace / "checkpoints").glob("*")), "finished work leaves no checkpoint"
     assert killed == KILLS

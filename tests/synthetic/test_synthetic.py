@@ -83,7 +83,9 @@ def test_standing_feet_do_not_slip(cat: Body) -> None:
 def test_bones_move_rigidly(cat: Body) -> None:
     moving = motion.perform(cat, motion.improvise(np.random.default_rng(0), 2.0), np.arange(0, 2, 0.1))
     rotation = moving.bones[..., :3, :3]
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-9)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-9
+    )
     step = np.abs(np.diff(moving.bones, axis=0)).max()
     assert step < 0.6, "no joint jumps between frames"
 
