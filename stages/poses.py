@@ -14,7 +14,6 @@ from stages.registration.answer import Answer, Provider, Subject
 from stages.registration.cues import CROP_MARGIN, Cues, crop_frame
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
 from stages.registration.placing import (
-    OBJECT_DEPTH,
     default_intrinsics,
     depth_from_size,
     mask_boxes,
@@ -23,12 +22,13 @@ from stages.registration.placing import (
     smooth,
     transforms,
 )
+from stages.registration.search import search
 from stages.registration.upright import upright
 
 CROP_PX = 48
 LOW_TRUST = 0.5
 GIVEN = ".poses.json"
-PROVIDERS: dict[str, Provider] = {"upright": upright}
+PROVIDERS: dict[str, Provider] = {"search": search, "upright": upright}
 """Providers by name, best first; `auto` takes, clip by clip, the answer that is trusted most."""
 
 

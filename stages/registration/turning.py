@@ -41,7 +41,7 @@ def turn_rates(cues: Cues, relief: np.ndarray, centroid_weight: float = 0.3) -> 
         rows_v = np.stack([near, zero, x, zero, one, y], 1)
         rows, target = np.concatenate([rows_u, rows_v]), np.concatenate([motion[:, 0], motion[:, 1]])
         robust = np.concatenate([weight, weight])
-        prior = np.diag([0.02, 0.02, 0.02, centroid_weight, centroid_weight, 0.02]) * weight.sum()
+        prior = np.diag([0.002, 0.002, 0.02, centroid_weight, centroid_weight, 0.02]) * weight.sum()
         for _ in range(6):
             normal = (rows * robust[:, None]).T @ rows + prior
             solution = np.linalg.solve(normal, (rows * robust[:, None]).T @ target)

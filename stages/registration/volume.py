@@ -1,8 +1,8 @@
-"""A small coloured volume seen from a bank of views: rendering, and its way back from pictures to volume.
+"""A small coloured volume seen from a bank of views, rendered differentiably.
 
 The volume is a cube of N^3 voxels about the object's origin, side ``2 EXTENT`` units, index order (z, y, x) as
 ``grid_sample`` wants it, in object space (y up). A view looks at the origin from OBJECT_DEPTH away; its picture is the
-S x S window that spans ``+-EXTENT`` units at that depth. All tensors float32 on one device.
+S x S window that spans ``+-EXTENT`` units at that depth. All tensors float32.
 """
 
 from __future__ import annotations
@@ -17,87 +17,82 @@ from stages.registration.placing import OBJECT_DEPTH, view_rotation
 
 EXTENT = 1.25
 """Half the side of the volume and of the pictures' window, units."""
-
-
-@dataclass
-class Volume:
-    """Occupancy (N, N, N) in 0..1, colour (C, N, N, N) and how well the colour is known (N, N, N) in 0..1."""
-
-    occupancy: torch.Tensor
-    colour: torch.Tensor
-    known: torch.Tensor
-
-    def channels(self) -> torch.Tensor:
-        """All of it, (1, C + 2, N, N, N): occupancy, known, colour."""
-        return torch.cat([self.occupancy[None], self.known[None], self.colour])[None]
+_ABSORPTION = 12.0
+"""Per unit of full occupancy: a sixth of a unit is nearly opaque."""
 
 
 @dataclass
 class Picture:
-    """P rendered views: opacity (P, S, S), known (P, S, S), colour (P, C, S, S), relief (P, S, S) in units.
+    """P rendered views: opacity (P, S, S), colour times opacity (P, C, S, S), relief (P, S, S) in units.
 
-    Relief is the surface's distance in front of the object's origin; colour and known are times opacity.
+    Relief is how far the visible surface lies in front of the object's origin.
     """
 
     opacity: torch.Tensor
-    known: torch.Tensor
     colour: torch.Tensor
     relief: torch.Tensor
 
 
 class ViewBank:
-    """Views by azimuth and elevation (P,) radians, with the sampling positions both ways worked out once."""
+    """Views on a grid of azimuths times elevations (radians): view ``a * len(elevation) + e``."""
 
-    def __init__(self, azimuth: np.ndarray, elevation: np.ndarray, size: int, voxels: int) -> None:
+    def __init__(self, azimuth: np.ndarray, elevation: np.ndarray, size: int) -> None:
         self.azimuth, self.elevation = np.asarray(azimuth, np.float64), np.asarray(elevation, np.float64)
-        self.size, self.voxels = size, voxels
-        self.rotation = torch.as_tensor(view_rotation(self.azimuth, self.elevation), dtype=torch.float32)
-        axis = (torch.arange(size, dtype=torch.float32) + 0.5) * (2 / size) - 1
-        steps = size
-        depth = ((torch.arange(steps, dtype=torch.float32) + 0.5) * (2 / steps) - 1) * EXTENT
-        self.depth = depth  # relative to the origin, away from the camera
-        zoom = (OBJECT_DEPTH + depth) / OBJECT_DEPTH * EXTENT
-        shape = (size, size, steps)  # row, column, depth
-        self.ray = torch.stack(
-            [
-                (axis[None, :, None] * zoom).expand(shape),
-                (axis[:, None, None] * zoom).expand(shape),
-                depth.expand(shape),
-            ],
-            -1,
-        ).reshape(-1, 3)
-        centre = ((torch.arange(voxels, dtype=torch.float32) + 0.5) * (2 / voxels) - 1) * EXTENT
-        z, y, x = torch.meshgrid(centre, centre, centre, indexing="ij")
-        self.point = torch.stack([x, y, z], -1).reshape(-1, 3)
+        self.shape = (len(self.azimuth), len(self.elevation))
+        self.size = size
+        grid_a, grid_e = np.meshgrid(self.azimuth, self.elevation, indexing="ij")
+        self.rotation = torch.as_tensor(view_rotation(grid_a.ravel(), grid_e.ravel()), dtype=torch.float32)
+        axis = pixel_axis(size)
+        self.depth = axis * EXTENT  # of the steps along a ray, beyond the origin
+        zoom = (OBJECT_DEPTH + self.depth) / OBJECT_DEPTH * EXTENT
+        shape = (size, size, size)  # row, column, depth
+        parts = [axis[None, :, None] * zoom, axis[:, None, None] * zoom, self.depth]
+        self._ray = torch.stack([p.expand(shape) for p in parts], -1).reshape(-1, 3)
 
     def __len__(self) -> int:
         return len(self.rotation)
 
-    def render(self, volume: Volume, view_idx: torch.Tensor | None = None) -> Picture:
-        """Pictures of the volume from the views (all of them by default)."""
-        rotation = self.rotation if view_idx is None else self.rotation[view_idx]
-        channels = volume.channels()
-        out: list[list[torch.Tensor]] = [[], [], [], []]
-        sharp = 12.0 * 2 * EXTENT / self.size  # opacity of one step through full occupancy: nearly opaque in 0.2 units
+    def render(self, occupancy: torch.Tensor, colour: torch.Tensor, rotation: torch.Tensor | None = None) -> Picture:
+        """Pictures of occupancy (N, N, N) in 0..1 and colour (C, N, N, N), from these rotations (all views of the bank).
+
+        Light is absorbed along the ray; each step's share is ``T (1 - exp(-k o))``.
+        """
+        rotation = self.rotation if rotation is None else rotation
+        channels = torch.cat([occupancy[None], colour])[None]
+        size = self.size
+        strength = _ABSORPTION * 2 * EXTENT / size
+        opacity, colours, reliefs = [], [], []
         for some in rotation.split(16):
-            at = (self.ray @ some) / EXTENT  # x_obj = R^T x_cam
+            at = (self._ray @ some) / EXTENT  # x_obj = R^T x_cam
             sampled = grid_sample(
                 channels.expand(len(some), -1, -1, -1, -1),
-                at.reshape(len(some), self.size * self.size, -1, 1, 3),
+                at.reshape(len(some), size * size, -1, 1, 3),
                 align_corners=False,
-            )
-            sampled = sampled.reshape(len(some), channels.shape[1], self.size, self.size, -1)
-            passing = torch.exp(-sharp * sampled[:, 0])
-            through = torch.cumprod(torch.cat([torch.ones_like(passing[..., :1]), passing[..., :-1]], -1), -1)
-            weight = through * (1 - passing)
-            out[0].append(weight.sum(-1))
-            out[1].append((weight * sampled[:, 1]).sum(-1))
-            out[2].append((weight[:, None] * sampled[:, 2:]).sum(-1))
-            out[3].append(-(weight * self.depth).sum(-1) / weight.sum(-1).clamp(min=1e-3))
-        return Picture(*(torch.cat(part) for part in out))
+            ).reshape(len(some), channels.shape[1], size, size, size)
+            thickness = strength * sampled[:, 0]
+            before = torch.cumsum(thickness, -1) - thickness
+            weight = torch.exp(-before) * (1 - torch.exp(-thickness))
+            total = weight.sum(-1)
+            opacity.append(total)
+            colours.append((weight[:, None] * sampled[:, 1:]).sum(-1))
+            reliefs.append(-(weight.detach() * self.depth).sum(-1) / total.detach().clamp(min=1e-3))
+        return Picture(torch.cat(opacity), torch.cat(colours), torch.cat(reliefs))
 
-    def project(self, view_idx: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Every voxel's place in each view's window, (P, N^3, 2) in -1..1, and its relief (P, N^3) in units."""
-        camera = self.point @ self.rotation[view_idx].transpose(1, 2)
-        scale = OBJECT_DEPTH / (OBJECT_DEPTH + camera[..., 2]) / EXTENT
-        return camera[..., :2] * scale[..., None], -camera[..., 2]
+
+def pixel_axis(size: int) -> torch.Tensor:
+    """Centres of `size` pixels across -1..1, (size,)."""
+    return (torch.arange(size, dtype=torch.float32) + 0.5) * (2 / size) - 1
+
+
+def pixel_grid(size: int) -> torch.Tensor:
+    """Centres of the pixels of a square picture, (size, size, 2) as x, y in -1..1."""
+    axis = pixel_axis(size)
+    return torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)
+
+
+def centre_and_area(opacity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Centroid (P, 2) and area (P,) of soft masks (P, S, S), where the picture spans -1..1 (so its area is 4)."""
+    axis = pixel_axis(opacity.shape[-1])
+    total = opacity.sum((1, 2)).clamp(min=1.0)
+    centre = torch.stack([(opacity * axis).sum((1, 2)), (opacity * axis[:, None]).sum((1, 2))], 1) / total[:, None]
+    return centre, total * (2 / opacity.shape[-1]) ** 2

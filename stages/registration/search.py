@@ -1,0 +1,201 @@
+"""Root poses of any object, without a network: many hypotheses, each a volume and its poses; the best explain the frames.
+
+From random starts, expectation maximisation between a small coloured volume and the frames' views (as single-particle
+microscopy reconstructs molecules from unknown projections), tied in time and led by the flow; the better half goes
+on; clips are registered anew to the volume of the others; mirrored hypotheses are tried on purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.registration.answer import Answer, Subject, Tell
+from stages.registration.cues import CROP_MARGIN, inflate
+from stages.registration.model import Hypothesis, Sequence, Weights
+from stages.registration.placing import smooth, view_angles, view_rotation
+from stages.registration.tracking import posterior_angles
+from stages.registration.turning import turn_rates
+from stages.registration.volume import ViewBank
+from stages.registration.windows import Windows, whiten_together
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How hard to search."""
+
+    starts: int = 14
+    rounds: int = 14
+    fine_rounds: int = 8
+    frames: int = 150
+    """Most frames looked at, all clips together."""
+    coarse_px: int = 24
+    fine_px: int = 32
+
+
+COARSE_ELEVATION = np.radians([18.0])
+FINE_ELEVATION = np.radians([-5.0, 10.0, 25.0, 42.0])
+AZIMUTHS = 36
+MARGIN = 0.004
+"""Difference of evidence (cost a frame) at which two hypotheses are told apart with some confidence."""
+
+
+def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effort()) -> dict[str, Answer]:
+    """Answers for every clip whose poses are not given."""
+    chosen = choose_frames([len(s.cues) for s in subjects], effort.frames)
+    drifts = [flow_turns(s) for s in subjects]
+    bank = ViewBank(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, COARSE_ELEVATION, effort.coarse_px)
+    sequences = make_sequences(subjects, chosen, drifts, bank)
+    total = effort.starts * 6 + max(2, effort.starts // 3) * effort.rounds + 3 * effort.fine_rounds
+    clock = _Clock(tell, total)
+    starts = [Hypothesis(sequences, bank, effort.coarse_px, Weights(), seed * 1000 + i) for i in range(effort.starts)]
+    for i, hypothesis in enumerate(starts):
+        scatter(hypothesis, np.random.default_rng([seed, i]))
+        anneal(hypothesis, 8.0, 12.0, 6, clock)
+    kept = sorted(starts, key=lambda h: h.evidence)[: max(2, effort.starts // 3)]
+    for hypothesis in kept:
+        anneal(hypothesis, 12.0, 30.0, effort.rounds - 6, clock)
+    kept.sort(key=lambda h: h.evidence)
+    rivals = sorted(kept + [reregister(h, clock) for h in kept[:2]], key=lambda h: h.evidence)
+    best = finer(rivals[0], subjects, chosen, drifts, effort, clock)
+    return {s.name: _answer(s, k, best, rivals, chosen[k]) for k, s in enumerate(subjects) if s.rotation is None}
+
+
+class _Clock:
+    def __init__(self, tell: Tell, total: int) -> None:
+        self.tell, self.total, self.done = tell, total, 0
+
+    def tick(self) -> None:
+        self.done += 1
+        self.tell(min(self.done, self.total), self.total, "searching root poses")
+
+
+def choose_frames(lengths: list[int], most: int) -> list[np.ndarray]:
+    """Frames to look at in each clip: evenly spread, every third at most, `most` in all, at least 8 a clip."""
+    wanted = np.array([max(8, n // 3) for n in lengths], np.float64)
+    wanted *= min(1.0, most / wanted.sum())
+    return [
+        np.unique(np.round(np.linspace(0, n - 1, min(n, max(8, int(w))))).astype(np.int64))
+        for n, w in zip(lengths, wanted, strict=True)
+    ]
+
+
+def flow_turns(subject: Subject) -> np.ndarray:
+    """(T,) turn about the vertical from each frame to the next, radians, as the flow suggests; see turn_rates."""
+    relief = inflate(subject.cues.mask) * 2 / subject.cues.mask.shape[1]
+    rates, _ = turn_rates(subject.cues, relief)
+    return np.clip(smooth(rates[:, 1], 2.0), -0.2, 0.2)
+
+
+def make_sequences(
+    subjects: list[Subject], chosen: list[np.ndarray], drifts: list[np.ndarray], bank: ViewBank
+) -> list[Sequence]:
+    """The clips at their chosen frames, colours brought together, given poses turned into posteriors."""
+    windows = [Windows(s.cues, idx, bank.size) for s, idx in zip(subjects, chosen, strict=True)]
+    whiten_together(windows)
+    sequences = []
+    for subject, idx, drift, window in zip(subjects, chosen, drifts, windows, strict=True):
+        total = np.concatenate([[0.0], np.cumsum(drift)])
+        gap = np.diff(idx)
+        fixed = None
+        if subject.rotation is not None:
+            azimuth, elevation, _ = view_angles(subject.rotation[idx])
+            fixed = spread(bank, azimuth, elevation)
+        sequences.append(Sequence(window, np.diff(total[idx]), 0.07 * np.sqrt(gap), fixed))
+    return sequences
+
+
+def spread(bank: ViewBank, azimuth: np.ndarray, elevation: np.ndarray | None, width: float = 0.12) -> np.ndarray:
+    """Posterior (T, A, E) about known angles; all elevations alike when they are not known."""
+    turn = np.angle(np.exp(1j * (azimuth[:, None] - bank.azimuth[None])))
+    out = np.exp(-0.5 * (turn / width) ** 2)[:, :, None] * np.ones((1, 1, len(bank.elevation)))
+    if elevation is not None:
+        out = out * (np.exp(-0.5 * ((elevation[:, None] - bank.elevation[None]) / 0.15) ** 2)[:, None] + 1e-9)
+    return out / out.sum(axis=(1, 2), keepdims=True)
+
+
+def scatter(hypothesis: Hypothesis, random: np.random.Generator) -> None:
+    """A random start: every clip at a random bearing, turning as its flow says or faster, slower, or backwards."""
+    for k, s in enumerate(hypothesis.sequences):
+        path = np.concatenate([[0.0], np.cumsum(s.drift)]) * random.uniform(0.5, 1.5)
+        path = path + np.linspace(-0.5, 0.5, len(path)) * random.normal(0.0, 1.2)
+        start = random.uniform(0, 2 * np.pi)
+        hypothesis.posterior[k] = spread(hypothesis.bank, path + start, None, 0.25) if s.fixed is None else s.fixed
+
+
+def anneal(hypothesis: Hypothesis, first: float, last: float, rounds: int, clock: _Clock) -> None:
+    """Rounds of improve and look, the likelihood sharpening from `first` to `last`."""
+    hypothesis.restart()
+    for i in range(rounds):
+        hypothesis.improve(12 if not np.isfinite(hypothesis.evidence) else 6)
+        hypothesis.look(first * (last / first) ** (i / max(rounds - 1, 1)))
+        clock.tick()
+
+
+def reregister(hypothesis: Hypothesis, clock: _Clock) -> Hypothesis:
+    """Each clip in turn looked up anew in a volume made without it; then all together."""
+    best = hypothesis
+    clips = range(len(hypothesis.sequences))
+    if len(hypothesis.sequences) < 2:
+        return hypothesis.copy()
+    trial = best.copy()
+    for k in clips:
+        if trial.sequences[k].fixed is not None:
+            continue
+        without = trial.copy()
+        without.improve(8, [j for j in clips if j != k])
+        without.look(15.0, [k])
+        trial.posterior[k] = without.posterior[k]
+        clock.tick()
+    anneal(trial, 20.0, 30.0, 4, clock)
+    return trial
+
+
+def finer(
+    hypothesis: Hypothesis,
+    subjects: list[Subject],
+    chosen: list[np.ndarray],
+    drifts: list[np.ndarray],
+    effort: Effort,
+    clock: _Clock,
+) -> Hypothesis:
+    """The same hypothesis with more pixels, voxels and elevations, a few rounds on."""
+    bank = ViewBank(hypothesis.bank.azimuth, FINE_ELEVATION, effort.fine_px)
+    sequences = make_sequences(subjects, chosen, drifts, bank)
+    fine = Hypothesis(sequences, bank, effort.fine_px, hypothesis.weights, 0)
+    fine.units = [u.clone() for u in hypothesis.units]
+    for k, s in enumerate(sequences):
+        azimuth, elevation, _ = posterior_angles(hypothesis.posterior[k], bank.azimuth, hypothesis.bank.elevation)
+        fine.posterior[k] = spread(bank, azimuth, elevation) if s.fixed is None else s.fixed
+    anneal(fine, 20.0, 30.0, effort.fine_rounds, clock)
+    return fine
+
+
+def _answer(subject: Subject, k: int, best: Hypothesis, rivals: list[Hypothesis], chosen: np.ndarray) -> Answer:
+    azimuth, elevation, sharp = posterior_angles(best.posterior[k], best.bank.azimuth, best.bank.elevation)
+    every = np.arange(len(subject.cues))
+    azimuth = smooth(np.interp(every, chosen, np.unwrap(azimuth)), 2.0)
+    elevation = smooth(np.interp(every, chosen, elevation), 3.0)
+    units = np.interp(every, chosen, best.units[k].numpy())
+    trust = agreement(best, rivals, k)
+    confidence = trust * np.interp(every, chosen, sharp) * np.where(subject.cues.cut, 0.5, 1.0)
+    figures = {"cost": round(best.cost[k], 4), "evidence": round(best.evidence, 4)}
+    return Answer("search", view_rotation(azimuth, elevation), 2 * units / CROP_MARGIN, confidence, trust, figures)
+
+
+def agreement(best: Hypothesis, rivals: list[Hypothesis], k: int) -> float:
+    """How far the rivals, weighted by their evidence, agree with the best about clip `k` relative to the others."""
+
+    def bearings(h: Hypothesis, j: int) -> np.ndarray:
+        return np.exp(1j * posterior_angles(h.posterior[j], h.bank.azimuth, h.bank.elevation)[0])
+
+    clips = range(len(best.sequences))
+    say = np.array([np.exp(-(h.evidence - rivals[0].evidence) / MARGIN) for h in rivals])
+    agrees = []
+    for h in rivals:
+        own = bearings(best, k) / bearings(h, k)
+        others = [bearings(best, j) / bearings(h, j) for j in clips if j != k] or [own]
+        turn = np.concatenate(others).mean()
+        agrees.append(float(np.mean(np.abs(np.angle(own / (turn / max(abs(turn), 1e-9)))) < np.pi / 4)))
+    return float(np.dot(say, agrees) / say.sum())
