@@ -1,8 +1,8 @@
-"""Stage: what a user holds at the end. A rigged, animated GLB, a mesh for every frame, cameras, videos, an honest report.
+"""Stage: what a user holds at the end: a rigged, animated GLB, meshes, cameras, videos, an honest report.
 
 The folder::
 
-    model.glb                   surface, skin, joints in a tree, one animation a video, root motion apart, cameras
+    model.glb                   surface, texture, skin, joints in a tree, a clip a video, root motion apart, cameras
     rest.ply                    the surface at rest; property ``views`` counts the frames that saw each vertex
     meshes/<video>/00042.ply    the surface articulated at every frame of the source, object space (root motion off)
     cameras/<video>.json        K and object_to_camera of every frame of the source, usable as a given ``.poses.json``
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,24 @@ import numpy as np
 
 from pipeline import Folder, Resources, Run, Scene, stage
 from stages import formats
+from stages.export_files import (
+    ExportedVideo,
+    Texture,
+    write_bones,
+    write_cameras,
+    write_meshes,
+    write_overlay,
+    write_rest,
+    write_turntable,
+)
 from stages.geometry.raster import rasterise, vertex_normals
-from stages.meshing import gltf, pictures, ply, quality
-from stages.meshing.rig import Animatable, PosedClip, Rig, build_rig, pose_clip, surface_colour
+from stages.meshing import atlas, gltf, pictures, quality
+from stages.meshing.rig import Animatable, PosedClip, Rig, build_rig, field_colour, pose_clip, surface_colour
 from stages.model.banmo import Banmo
-from stages.video_io import read_pictures, write_video
+from stages.video_io import read_pictures
 
 _QUALITY_SIDE_PX = 256
+_BAKED_FRAMES = 60  # of all videos together
 
 
 @dataclass(frozen=True)
@@ -45,28 +55,14 @@ class ExportSettings:
     """Faces of the exported mesh at most."""
     influences: int = 8
     """Bones that move a vertex at most; many viewers use the first four."""
+    texture_px: int = 1024
+    """Side of the texture, coloured from the frames; 0 leaves vertex colours only."""
     frame_meshes: bool = True
     """Write a mesh for every frame of every video."""
     video_side_px: int = 384
     """Longer side of one picture in the turntable and the overlays."""
     turntable_frames: int = 72
     """Pictures of one turn, at 24 a second."""
-
-
-@dataclass(frozen=True)
-class _Inputs:
-    """One video as the stages before left it."""
-
-    name: str
-    clip: formats.Clip
-    masks: Path
-    facts: formats.MaskFacts
-    root_confidence: np.ndarray
-
-    def mask(self, frame_idx: int, width_px: int, height_px: int) -> np.ndarray:
-        """(H, W) bool at another size."""
-        grey = formats.read_grey(self.masks / self.clip.names[frame_idx])
-        return np.asarray(cv2.resize(grey, (width_px, height_px), interpolation=cv2.INTER_AREA)) > 127
 
 
 @stage(per=Scene, version=1, needs=Resources(cpus=1))
@@ -85,14 +81,14 @@ def export(
     for name in model.video_names:
         track = formats.read_poses(refine / "poses" / f"{name}.json")
         clip, facts = formats.read_clip(frames[name].path), formats.read_mask_facts(masks[name].path)
-        inputs.append(_Inputs(name, clip, masks[name].path, facts, track.confidence))
+        inputs.append(ExportedVideo(name, clip, masks[name].path, facts, track.confidence))
     summary = formats.read_json(poses / "poses.json") if (poses / "poses.json").is_file() else {}
     export_model(model, inputs, summary, settings, out, run)
 
 
 def export_model(
     model: Animatable,
-    inputs: list[_Inputs],
+    inputs: list[ExportedVideo],
     pose_summary: dict[str, Any],
     settings: ExportSettings,
     out: Path,
@@ -105,39 +101,24 @@ def export_model(
     run.log.info("surface: %d faces, %d joints", len(rig.mesh.faces), len(rig.skeleton))
     colours = [surface_colour(model, rig, k) for k in range(len(inputs))]
     colour = np.mean(colours, axis=0)
+    clips = [pose_clip(model, rig, k, times[k]) for k in range(len(inputs))]
 
     views = np.zeros(len(rig.mesh.vertices))
-    motions, figures = [], []
-    for k, video in enumerate(inputs):
-        posed = pose_clip(model, rig, k, video.clip.source_time_s)
-        _write_cameras(out, video, posed)
+    figures = [_measure(video, rig, posed, views, run) for video, posed in zip(inputs, clips, strict=True)]
+    texture = _bake(model, rig, inputs, clips, settings.texture_px, run) if settings.texture_px > 0 else None
+    for k, (video, posed) in enumerate(zip(inputs, clips, strict=True)):
+        write_cameras(out, video, posed)
         if settings.frame_meshes:
-            _write_meshes(out, video, rig, posed, colours[k])
-        figures.append(_measure(video, rig, posed, views, run))
-        _write_overlay(out, video, rig, posed, colours[k], settings, run)
-        motions.append(
-            gltf.ClipMotion(
-                video.name,
-                video.clip.source_time_s,
-                posed.joints,
-                posed.camera_from_object,
-                posed.intrinsics,
-                video.clip.width,
-                video.clip.height,
-            )
-        )
-
-    _write_turntable(out, rig, colour, settings, run)
-    writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), {"views": views.astype(np.float32)})
-    (out / "rest.ply").write_bytes(writer.encode(rig.mesh.vertices))
-    formats.write_json(out / "bones.json", _bones(model, rig))
+            write_meshes(out, video, rig, posed, colours[k])
+        write_overlay(out, video, rig, posed, colours[k], settings.video_side_px, run)
+    write_turntable(out, rig, colour, texture, settings.video_side_px, settings.turntable_frames, run)
+    write_rest(out, rig, colour, views)
+    write_bones(out, model, rig)
     report = quality.report(rig.mesh, rig.normals, rig.facts, figures, views, pose_summary)
+    report["texture_from_frames"] = None if texture is None else round(texture.from_frames, 4)
     formats.write_json(out / "quality.json", report)
-
-    joint_idx, weight = rig.joint_skin(kept)
-    mesh = gltf.RiggedMesh("model", rig.mesh.vertices, rig.normals, rig.mesh.faces, colour, joint_idx, weight)
     extras = {"length": rig.mesh.length, "trust": report["trust"], "verdict": report["verdict"]}
-    (out / "model.glb").write_bytes(gltf.write_glb(mesh, rig.skeleton, motions, extras))
+    (out / "model.glb").write_bytes(_glb(rig, inputs, clips, colour, texture, kept, extras))
 
     for name in ("trust", "iou_mean", "unseen_area", "skinning_error", "faces"):
         run.metric(name, report[name])
@@ -180,95 +161,83 @@ def _sheet(out: Path, picture: Path) -> None:
     formats.write_image(picture, np.concatenate(strips))
 
 
-# --------------------------------------------------------------------------------------------- files
+# --------------------------------------------------------------------------------------------- parts
 
 
-def _write_cameras(out: Path, video: _Inputs, posed: PosedClip) -> None:
-    (out / "cameras").mkdir(exist_ok=True)
-    formats.write_json(
-        out / "cameras" / f"{video.name}.json",
-        {
-            "K": posed.intrinsics.tolist(),
-            "width": video.clip.width,
-            "height": video.clip.height,
-            "source_idx": list(range(len(posed.vertices))),
-            "time_s": video.clip.source_time_s.tolist(),
-            "object_to_camera": posed.camera_from_object.tolist(),
-        },
-    )
+def _glb(
+    rig: Rig,
+    inputs: list[ExportedVideo],
+    clips: list[PosedClip],
+    colour: np.ndarray,
+    texture: Texture | None,
+    influences: int,
+    extras: dict[str, Any],
+) -> bytes:
+    motions = [
+        gltf.ClipMotion(
+            video.name,
+            video.clip.source_time_s,
+            posed.joints,
+            posed.camera_from_object,
+            posed.intrinsics,
+            video.clip.width,
+            video.clip.height,
+        )
+        for video, posed in zip(inputs, clips, strict=True)
+    ]
+    joint_idx, weight = rig.joint_skin(influences)
+    if texture is None:
+        mesh = gltf.RiggedMesh("model", rig.mesh.vertices, rig.normals, rig.mesh.faces, colour, joint_idx, weight)
+    else:
+        cut = texture.atlas.vertex  # a vertex on a seam has several texture coordinates, so it is written several times
+        mesh = gltf.RiggedMesh(
+            "model",
+            rig.mesh.vertices[cut],
+            rig.normals[cut],
+            texture.atlas.faces,
+            colour[cut],
+            joint_idx[cut],
+            weight[cut],
+            texture.atlas.uv,
+            _png(texture.picture),
+        )
+    return gltf.write_glb(mesh, rig.skeleton, motions, extras)
 
 
-def _write_meshes(out: Path, video: _Inputs, rig: Rig, posed: PosedClip, colour: np.ndarray) -> None:
-    folder = out / "meshes" / video.name
-    folder.mkdir(parents=True)
-    writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), {})
-    for i, vertices in enumerate(posed.vertices):
-        (folder / f"{i:05d}.ply").write_bytes(writer.encode(vertices))
+def _png(picture: np.ndarray) -> bytes:
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not ok:
+        raise formats.FormatError(f"cannot encode a texture of shape {picture.shape}")
+    return bytes(data)
 
 
-def _look(rig: Rig, colour: np.ndarray) -> pictures.Look:
-    palette = pictures.joint_palette(len(rig.skeleton))
-    return pictures.Look(rig.mesh.faces, colour, rig.weights[:, rig.skeleton.bone] @ palette, rig.skeleton.parent)
+def _bake(
+    model: Animatable, rig: Rig, inputs: list[ExportedVideo], clips: list[PosedClip], size_px: int, run: Run
+) -> Texture:
+    """Colour the texture from frames spread over all videos."""
+    charts = atlas.unwrap(rig.mesh, size_px)
+    texels = atlas.texels_of(charts, size_px)
+    points = texels.spread(rig.mesh.faces, rig.mesh.vertices)
+    baker = atlas.Baker(rig.mesh, texels, field_colour(model, points, len(inputs)))
+    per_video = max(1, _BAKED_FRAMES // len(inputs))
+    chosen = [
+        (video, posed, int(i))
+        for video, posed in zip(inputs, clips, strict=True)
+        for i in np.unique(np.linspace(0, len(video.clip) - 1, per_video).round())
+        if "missing" not in video.facts.flags[int(i)]
+    ]
+    for video, posed, i in run.progress(chosen, label="texture"):
+        pose = posed.camera_from_object[video.clip.source_idx[i]]
+        points = posed.vertices[video.clip.source_idx[i]] @ pose[:3, :3].T + pose[:3, 3]
+        width, height = video.clip.width, video.clip.height
+        fragments = rasterise(points, rig.mesh.faces, posed.intrinsics, height, width)
+        mask = video.mask(i, width, height)
+        baker.add(points, posed.intrinsics, fragments, video.clip.image(i), mask, 0.01 * rig.mesh.length)
+    picture, from_frames = baker.picture()
+    return Texture(charts, picture, from_frames)
 
 
-def _write_turntable(out: Path, rig: Rig, colour: np.ndarray, settings: ExportSettings, run: Run) -> None:
-    side = max(2, settings.video_side_px // 2 * 2)
-    sticks = rig.skeleton.sticks(rig.skeleton.rest)
-    images = pictures.turntable(_look(rig, colour), rig.mesh.vertices, sticks, settings.turntable_frames, side)
-    shown = run.progress(images, settings.turntable_frames, "turntable")
-    write_video(out / "turntable.mp4", shown, np.arange(settings.turntable_frames) / 24)
-
-
-def _write_overlay(
-    out: Path, video: _Inputs, rig: Rig, posed: PosedClip, colour: np.ndarray, settings: ExportSettings, run: Run
-) -> None:
-    clip, look = video.clip, _look(rig, colour)
-    width, height, _ = pictures.scaled_size(clip.width, clip.height, settings.video_side_px)
-    intrinsics = pictures.scaled_intrinsics(posed.intrinsics, clip.width, clip.height, width, height)
-    # A source frame that was not kept is shown as the kept one before it.
-    shown = np.maximum(np.searchsorted(clip.source_idx, np.arange(len(posed.vertices)), side="right") - 1, 0)
-
-    def draw() -> Iterator[np.ndarray]:
-        held = -1
-        frame: np.ndarray = np.zeros((height, width, 3), np.uint8)
-        for i, pose in enumerate(posed.camera_from_object):
-            if shown[i] != held:
-                held = int(shown[i])
-                frame = np.asarray(cv2.resize(clip.image(held), (width, height), interpolation=cv2.INTER_AREA))
-            points = posed.vertices[i] @ pose[:3, :3].T + pose[:3, 3]
-            sticks = rig.skeleton.sticks(posed.joints[i]) @ pose[:3, :3].T + pose[:3, 3]
-            yield pictures.overlay(look, points, sticks, intrinsics, frame)
-
-    images = run.progress(draw(), len(posed.vertices), f"overlay {video.name}")
-    write_video(out / f"overlay-{video.name}.mp4", images, clip.source_time_s)
-
-
-def _bones(model: Animatable, rig: Rig) -> dict[str, Any]:
-    skeleton, scales = rig.skeleton, model.bone_scales.cpu().numpy()
-    orientations = model.bone_orientations.cpu().numpy().astype(np.float64)
-    share = rig.weights.mean(axis=0)
-    return {
-        "space": "canonical: y up, z front; a joint is where the bone holds its parent; columns of orientation are the Gaussian's axes",
-        "bones": [
-            {
-                "name": skeleton.names[j],
-                "parent": skeleton.names[p] if p >= 0 else None,
-                "model_bone": int(b),
-                "joint": skeleton.rest[j, :3, 3].tolist(),
-                "centre": skeleton.centre[j].tolist(),
-                "orientation": orientations[b].tolist(),
-                "scale": [float(v) for v in scales[b]],
-                "surface_share": round(float(share[b]), 6),
-            }
-            for j, (b, p) in enumerate(zip(skeleton.bone, skeleton.parent, strict=True))
-        ],
-    }
-
-
-# --------------------------------------------------------------------------------------------- quality
-
-
-def _measure(video: _Inputs, rig: Rig, posed: PosedClip, views: np.ndarray, run: Run) -> quality.ClipQuality:
+def _measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray, run: Run) -> quality.ClipQuality:
     """Compare the posed mesh with every kept frame's mask; counts in `views` which vertices were seen."""
     clip = video.clip
     side = min(_QUALITY_SIDE_PX, max(clip.width, clip.height))

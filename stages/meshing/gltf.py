@@ -56,7 +56,9 @@ class RiggedMesh:
     """What the file holds at rest.
 
     vertices, normals: (V, 3); faces: (F, 3); colour: (V, 3) sRGB in 0..1;
-    joint_idx, weight: (V, K) skin, descending, K a multiple of nothing in particular (padded to 4 or 8 here).
+    joint_idx, weight: (V, K) skin, descending; padded to a multiple of four here.
+    uv: (V, 2) and texture_png: the colour as a picture. With it the vertex colours become the attribute ``_COLOR``,
+    since a viewer would multiply COLOR_0 with the texture.
     """
 
     name: str
@@ -66,6 +68,8 @@ class RiggedMesh:
     colour: np.ndarray
     joint_idx: np.ndarray
     weight: np.ndarray
+    uv: np.ndarray | None = None
+    texture_png: bytes | None = None
 
 
 @dataclass
@@ -74,19 +78,22 @@ class _Builder:
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
 
+    def view(self, data: bytes, target: int | None = None) -> int:
+        """Append bytes as one buffer view; returns its index."""
+        self.blob += b"\0" * (-len(self.blob) % 4)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data)}
+        if target is not None:
+            view["target"] = target
+        self.blob += data
+        self.views.append(view)
+        return len(self.views) - 1
+
     def add(self, data: np.ndarray, target: int | None = None, bounds: bool = False, normalised: bool = False) -> int:
         """Append an array (N,) or (N, C) as one buffer view and accessor; returns the accessor's index."""
         data = np.ascontiguousarray(data)
-        while len(self.blob) % 4:
-            self.blob.append(0)
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": data.nbytes}
-        if target is not None:
-            view["target"] = target
-        self.blob += data.tobytes()
-        self.views.append(view)
         flat = data.reshape(len(data), -1)
         accessor: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
+            "bufferView": self.view(data.tobytes(), target),
             "componentType": _COMPONENTS[data.dtype.name],
             "count": len(data),
             "type": _KINDS[flat.shape[1]],
@@ -159,22 +166,14 @@ def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], ext
         nodes.append({"name": f"camera_{clip.name}", "camera": k})
 
     inverse_bind = np.swapaxes(invert(skeleton.rest), 1, 2).astype(np.float32).reshape(count, 16)
+    matte: dict[str, Any] = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "banmo-pipeline", "extras": extras},
         "scene": 0,
         "scenes": [{"name": mesh.name, "nodes": top_nodes}],
         "nodes": nodes,
         "meshes": [{"name": mesh.name, "primitives": [_primitive(builder, mesh, count)]}],
-        "materials": [
-            {
-                "name": "surface",
-                "pbrMetallicRoughness": {
-                    "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 1.0,
-                },
-            }
-        ],
+        "materials": [{"name": "surface", "pbrMetallicRoughness": matte}],
         "skins": [
             {
                 "name": "skin",
@@ -184,6 +183,11 @@ def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], ext
             }
         ],
     }
+    if mesh.texture_png is not None:
+        matte["baseColorTexture"] = {"index": 0}
+        document["textures"] = [{"source": 0, "sampler": 0}]
+        document["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
+        document["images"] = [{"name": "colour", "mimeType": "image/png", "bufferView": builder.view(mesh.texture_png)}]
     if clips:
         document["cameras"] = [_camera(clip) for clip in clips]
         document["animations"] = [_animation(builder, clip, skeleton, joint_nodes) for clip in clips]
@@ -195,14 +199,19 @@ def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], ext
 def _primitive(builder: _Builder, mesh: RiggedMesh, joint_count: int) -> dict[str, Any]:
     vertex_count, kept = mesh.weight.shape
     colour = np.ones((vertex_count, 4))
-    colour[:, :3] = linear_from_srgb(mesh.colour)
     index_type = np.uint16 if vertex_count < 65_535 else np.uint32
     joint_type = np.uint8 if joint_count <= 256 else np.uint16
     attributes = {
         "POSITION": builder.add(mesh.vertices.astype(np.float32), _VERTEX_DATA, bounds=True),
         "NORMAL": builder.add(mesh.normals.astype(np.float32), _VERTEX_DATA),
-        "COLOR_0": builder.add(np.round(colour * 65535).astype(np.uint16), _VERTEX_DATA, normalised=True),
     }
+    if mesh.uv is not None and mesh.texture_png is not None:
+        attributes["TEXCOORD_0"] = builder.add(mesh.uv.astype(np.float32), _VERTEX_DATA)
+        colour[:, :3] = np.clip(mesh.colour, 0, 1)  # nobody but people reads this one: sRGB
+        attributes["_COLOR"] = builder.add(np.round(colour * 255).astype(np.uint8), _VERTEX_DATA, normalised=True)
+    else:
+        colour[:, :3] = linear_from_srgb(mesh.colour)
+        attributes["COLOR_0"] = builder.add(np.round(colour * 65535).astype(np.uint16), _VERTEX_DATA, normalised=True)
     for part in range(-(-kept // 4)):
         joints = np.zeros((vertex_count, 4), joint_type)
         weights = np.zeros((vertex_count, 4), np.float32)

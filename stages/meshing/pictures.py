@@ -10,19 +10,26 @@ import cv2
 import numpy as np
 
 from stages.geometry.raster import project, rasterise, vertex_normals
+from stages.meshing.atlas import sample
 
 _LIGHT = np.array([-0.35, -0.55, -0.76], np.float32)  # camera frame: from above, left of and behind the camera
 _PAPER = 0.93
+_ELEVATION = np.radians(12)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What is drawn: faces (F, 3), sRGB colours (V, 3) in 0..1, colours of the skin weights (V, 3), tree (B,)."""
+    """What is drawn: faces (F, 3), sRGB colours (V, 3) in 0..1, colours of the skin weights (V, 3), tree (B,).
+
+    With a `texture` (S, S, 3) uint8 and `corner_uv` (F, 3, 2) the colours come from there.
+    """
 
     faces: np.ndarray
     colour: np.ndarray
     skin: np.ndarray
     parent: np.ndarray
+    texture: np.ndarray | None = None
+    corner_uv: np.ndarray | None = None
 
 
 def joint_palette(count: int) -> np.ndarray:
@@ -36,7 +43,9 @@ def scaled_size(width_px: int, height_px: int, side_px: int) -> tuple[int, int, 
     return max(2, round(width_px * scale / 2) * 2), max(2, round(height_px * scale / 2) * 2), scale
 
 
-def scaled_intrinsics(intrinsics: np.ndarray, width_px: int, height_px: int, new_width: int, new_height: int) -> np.ndarray:
+def scaled_intrinsics(
+    intrinsics: np.ndarray, width_px: int, height_px: int, new_width: int, new_height: int
+) -> np.ndarray:
     """K of the same picture resized; pixel centres at half-integers make this a plain scaling of both rows."""
     return np.diag([new_width / width_px, new_height / height_px, 1.0]) @ intrinsics
 
@@ -66,6 +75,10 @@ def paint(
     attribute = np.concatenate([look.colour, look.skin, vertex_normals(vertices_camera, look.faces)], axis=1)
     pixels = fragments.pixels()
     values = fragments.at_pixels(pixels, look.faces, attribute)
+    if look.texture is not None and look.corner_uv is not None:
+        weight = fragments.barycentric.reshape(-1, 3)[pixels]
+        uv = np.einsum("pk,pkc->pc", weight, look.corner_uv[fragments.face_idx.reshape(-1)[pixels]])
+        values[:, :3] = sample(look.texture, uv)
     length = np.sqrt(np.einsum("pc,pc->p", values[:, 6:], values[:, 6:]))
     lit = np.clip(values[:, 6:] @ _LIGHT / np.maximum(length, 1e-6), 0, 1)[:, None]
     layers = np.zeros((height * supersample, width * supersample, 7), np.float32)
@@ -97,9 +110,7 @@ def _draw_bones(picture: np.ndarray, sticks_camera: np.ndarray, parent: np.ndarr
 
 def orbit(azimuth: float, elevation: float, centre: np.ndarray, distance: float) -> np.ndarray:
     """Camera_from_object (4, 4), OpenCV, of a camera that looks at `centre`; azimuth 0 sees the front (+z), y up."""
-    direction = np.array(
-        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
-    )
+    direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     forward = -direction
     right = np.cross(forward, (0.0, 1.0, 0.0))
     right /= np.linalg.norm(right)
@@ -112,16 +123,28 @@ def orbit(azimuth: float, elevation: float, centre: np.ndarray, distance: float)
 def turntable(look: Look, vertices: np.ndarray, sticks: np.ndarray, frames: int, side_px: int) -> Iterator[np.ndarray]:
     """One turn about the rest pose, (side, 2 side, 3) uint8 pictures: in colour, and in skin colours with bones."""
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     focal = 1.6 * side_px
-    distance = radius * 1.08 * np.hypot(1.6, 0.5) / 0.5
     intrinsics = np.array([[focal, 0, side_px / 2], [0, focal, side_px / 2], [0, 0, 1]])
+    azimuths = 2 * np.pi * np.arange(frames) / frames
+    distance = _fitting_distance(vertices, centre, azimuths, intrinsics)
     background = np.full((side_px, side_px, 3), _PAPER, np.float32)
-    for i in range(frames):
-        pose = orbit(2 * np.pi * i / frames, np.radians(12), centre, distance)
+    for azimuth in azimuths:
+        pose = orbit(azimuth, _ELEVATION, centre, distance)
         points = vertices @ pose[:3, :3].T + pose[:3, 3]
         bones = sticks @ pose[:3, :3].T + pose[:3, 3]
         yield np.concatenate(paint(look, points, bones, intrinsics, background, supersample=2), axis=1)
+
+
+def _fitting_distance(vertices: np.ndarray, centre: np.ndarray, azimuths: np.ndarray, intrinsics: np.ndarray) -> float:
+    """The nearest distance at which the object fills 92 % of the picture at most, from every azimuth."""
+    needed = 0.0
+    for azimuth in azimuths:
+        rotation = orbit(azimuth, _ELEVATION, centre, 1.0)[:3, :3]
+        relative = (vertices - centre) @ rotation.T
+        # |f x / (d + z)| <= 0.46 S, and the same for y
+        reach = np.abs(relative[:, :2]).max(axis=1) * intrinsics[0, 0] / (0.92 * intrinsics[0, 2]) - relative[:, 2]
+        needed = max(needed, float(reach.max()))
+    return needed
 
 
 def overlay(

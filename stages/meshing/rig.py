@@ -178,6 +178,17 @@ def surface_colour(model: Animatable, rig: Rig, video_idx: int) -> np.ndarray:
     return np.clip(np.mean(moments, axis=0, dtype=np.float64), 0, 1)
 
 
+def field_colour(model: Animatable, points: np.ndarray, video_count: int) -> np.ndarray:
+    """(N, 3) sRGB in 0..1 at canonical points (N, 3): mean over the light of up to four videos."""
+    chosen = np.unique(np.linspace(0, video_count - 1, min(4, video_count)).round().astype(int))
+    total = np.zeros((len(points), 3))
+    for start in range(0, len(points), _POINTS_PER_WARP):
+        part = _points(points[start : start + _POINTS_PER_WARP])
+        for k in chosen:
+            total[start : start + _POINTS_PER_WARP] += model.colour(part, int(k), 0.0).cpu().numpy()
+    return np.clip(total / len(chosen), 0, 1)
+
+
 def _warp(model: Animatable, vertices: np.ndarray, video_idx: int, time_s: np.ndarray) -> np.ndarray:
     points = _points(vertices)
     per_pass = max(1, _POINTS_PER_WARP // len(points))

@@ -43,7 +43,7 @@ class Skeleton:
         return inverse
 
     def posed(self, bone_transforms: np.ndarray) -> np.ndarray:
-        """Object_from_joint (T, B, 4, 4), joint order, of canonical-to-posed bone transforms (T, B, 4, 4), bone order."""
+        """Object_from_joint (T, B, 4, 4), joint order, of canonical-to-posed transforms (T, B, 4, 4), bone order."""
         return nearest_rigid(bone_transforms[:, self.bone].astype(np.float64)) @ self.rest
 
     def sticks(self, posed: np.ndarray) -> np.ndarray:
@@ -153,8 +153,9 @@ def build_skeleton(
     rest = np.tile(np.eye(4), (count, 1, 1))
     rest[:, :3, 3] = point[order, parent_bone]
     middle = (centres[order] + centres[parent_bone]) / 2
-    for _ in range(3 if inside is not None else 0):
-        outside = ~inside(rest[:, :3, 3])
-        rest[outside, :3, 3] = (rest[outside, :3, 3] + middle[outside]) / 2
+    if inside is not None:
+        for _ in range(3):
+            outside = ~inside(rest[:, :3, 3])
+            rest[outside, :3, 3] = (rest[outside, :3, 3] + middle[outside]) / 2
     names = [f"bone_{int(b):02d}" for b in order]
     return Skeleton(names, order.astype(np.int64), parent.astype(np.int64), rest, centres[order])

@@ -51,7 +51,7 @@ def slow_depth(vertices: np.ndarray, faces: np.ndarray, height: int, width: int)
 
 def test_depth_equals_the_slow_ray_caster() -> None:
     rng = np.random.default_rng(0)
-    vertices = rng.uniform(-1, 1, (24, 3)) + [0, 0, 3.0]
+    vertices = rng.uniform(-1, 1, (24, 3)) + np.array([0, 0, 3.0])
     faces = np.arange(24).reshape(8, 3)
     fast = rasterise(vertices, faces, INTRINSICS, 30, 34, cull_back=False).depth
     slow = slow_depth(vertices, faces, 30, 34)
@@ -64,7 +64,7 @@ def test_depth_equals_the_slow_ray_caster() -> None:
 
 def test_a_closed_mesh_has_no_cracks_and_culling_changes_nothing() -> None:
     vertices, faces = sphere(60, 90)
-    vertices = vertices + [0.1, -0.05, 3.0]
+    vertices = vertices + np.array([0.1, -0.05, 3.0])
     k = np.array([[160.0, 0, 64], [0, 160.0, 64], [0, 0, 1]])
     culled = rasterise(vertices, faces, k, 128, 128)
     whole = rasterise(vertices, faces, k, 128, 128, cull_back=False)

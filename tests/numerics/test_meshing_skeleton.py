@@ -40,7 +40,8 @@ def test_the_tree_and_the_joints_of_a_known_body_are_found() -> None:
     centres, transforms, joints = star(40, 1)
     vertices = np.concatenate([c + 0.05 * np.random.default_rng(2).normal(size=(40, 3)) for c in centres])
     skeleton = build_skeleton(centres, transforms, nearest_bone_weights(vertices, centres), vertices)
-    parent_bone = {int(b): int(skeleton.bone[p]) if p >= 0 else -1 for b, p in zip(skeleton.bone, skeleton.parent)}
+    pairs = zip(skeleton.bone, skeleton.parent, strict=True)
+    parent_bone = {int(b): int(skeleton.bone[p]) if p >= 0 else -1 for b, p in pairs}
     assert parent_bone == {2: -1, 0: 2, 3: 2, 5: 2, 1: 0, 4: 3, 6: 5}
     assert skeleton.parent[0] == -1
     assert (skeleton.parent[1:] < np.arange(1, 7)).all()
@@ -108,7 +109,7 @@ def test_the_largest_weights_are_kept_and_sum_to_one_in_float32() -> None:
 
 def test_blending_equals_a_loop() -> None:
     rng = np.random.default_rng(0)
-    centres, transforms, _ = star(3, 7)
+    _, transforms, _ = star(3, 7)
     vertices = rng.normal(size=(20, 3))
     weights = rng.dirichlet(np.ones(7), 20)
     index, value = top_influences(weights, 7)

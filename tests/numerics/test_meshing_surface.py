@@ -7,6 +7,7 @@ import trimesh
 
 from stages.meshing.surface import (
     EmptySurface,
+    Field,
     Mesh,
     boundary_loops,
     clean_surface,
@@ -20,7 +21,7 @@ from stages.meshing.surface import (
 BOUNDS = np.array([[-1.5, -1.4, -1.3], [1.5, 1.4, 1.3]])
 
 
-def ball(centre: tuple[float, float, float], radius: float):  # noqa: ANN201
+def ball(centre: tuple[float, float, float], radius: float) -> Field:
     return lambda p: (p - torch.tensor(centre)).norm(dim=-1) - radius
 
 

@@ -84,7 +84,9 @@ class Chain:
         return torch.tensor([[self.focal_px, 0, half], [0, self.focal_px, half], [0, 0, 1.0]])
 
 
-def write_inputs(model: Chain, root: Path, times: int = 6, dropped: tuple[int, ...] = (2,)) -> dict[str, dict[str, Path]]:
+def write_inputs(
+    model: Chain, root: Path, times: int = 6, dropped: tuple[int, ...] = (2,)
+) -> dict[str, dict[str, Path]]:
     """The folders of the stages before, as the model itself would be filmed: {"frames": {video: path}, ...}."""
     from stages.meshing.surface import extract
 

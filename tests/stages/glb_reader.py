@@ -1,4 +1,4 @@
-"""A second, independent reading of GLB files: accessors, node trees, keyframes and skinning, as the specification says."""
+"""A second, independent reading of GLB files: accessors, node trees, keyframes and skinning, by the specification."""
 
 from __future__ import annotations
 
@@ -81,7 +81,9 @@ class Glb:
         assert np.isfinite(result).all(), "a node hangs nowhere"
         return result
 
-    def skinned(self, animation: int | None, key: int, leave_out: tuple[int, ...] = (), influences: int = 8) -> np.ndarray:
+    def skinned(
+        self, animation: int | None, key: int, leave_out: tuple[int, ...] = (), influences: int = 8
+    ) -> np.ndarray:
         """(V, 3) vertices in the scene, by the specification's skinning."""
         skin = self.document["skins"][0]
         nodes = self.globals_of(self.locals_at(animation, key, leave_out))

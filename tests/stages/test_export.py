@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from tests.stages.articulated_chain import Chain, write_inputs
-from tests.stages.glb_reader import Glb
 
 from pipeline import Folder, Run
 from stages import export as stage_module
 from stages import formats
 from stages.export import ExportSettings, export
+from tests.stages.articulated_chain import Chain, write_inputs
+from tests.stages.glb_reader import Glb
 
-SETTINGS = ExportSettings(resolution=48, faces=900, video_side_px=96, turntable_frames=6)
+SETTINGS = ExportSettings(resolution=48, faces=900, texture_px=128, video_side_px=96, turntable_frames=6)
 NAMES = ["b 2", "chat-été 🐈"]
 FRAMES = 6
 
@@ -162,6 +162,8 @@ def test_the_khronos_validator_finds_no_error(result: tuple[Result, Path, Run]) 
 
 def test_trimesh_loads_it(result: tuple[Result, Path, Run]) -> None:
     mesh = trimesh.load(result[1] / "model.glb").to_geometry()
+    assert mesh.visual.kind == "texture"
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     assert mesh.is_watertight
     assert mesh.volume > 0
     assert len(mesh.faces) <= SETTINGS.faces
@@ -339,9 +341,15 @@ def test_the_contact_sheet_is_a_picture(result: tuple[Result, Path, Run], tmp_pa
     assert formats.read_image(tmp_path / "sheet.png").std() > 5
 
 
-def test_without_frame_meshes(stand_in: dict[str, Chain], tmp_path: Path) -> None:
+def test_without_texture_and_frame_meshes(stand_in: dict[str, Chain], tmp_path: Path) -> None:
     stand_in["model"] = Chain(["v"], bones=2)
-    made = Result(stand_in["model"], tmp_path, ExportSettings(32, 300, 4, False, 64, 2))
+    made = Result(stand_in["model"], tmp_path, ExportSettings(32, 300, 4, 0, False, 64, 2))
     out, _ = made.run(tmp_path / "out")
     assert not (out / "meshes").exists()
-    assert (out / "model.glb").stat().st_size > 1000
+    glb = Glb((out / "model.glb").read_bytes())
+    assert "textures" not in glb.document
+    colour = stand_in["model"].colour(torch.from_numpy(glb.attribute("POSITION").copy())).double().numpy()
+    linear = glb.attribute("COLOR_0")[:, :3] / 65535
+    np.testing.assert_allclose(
+        np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055), colour, atol=1e-3
+    )
