@@ -33,6 +33,11 @@ class Animatable(Protocol):
         ...
 
     @property
+    def bone_parents(self) -> Tensor | None:
+        """(B,) the parent of each bone, a root being its own; None where bones move loosely."""
+        ...
+
+    @property
     def bone_orientations(self) -> Tensor:
         """(B, 3, 3)."""
         ...
@@ -146,7 +151,8 @@ def build_rig(
     def inside(points: np.ndarray) -> np.ndarray:
         return evaluate(model.sdf, points) < facts.level
 
-    skeleton = build_skeleton(model.bone_centres.cpu().numpy(), motion, weights, mesh.vertices, inside)
+    parents = None if model.bone_parents is None else model.bone_parents.cpu().numpy()
+    skeleton = build_skeleton(model.bone_centres.cpu().numpy(), motion, weights, mesh.vertices, inside, parents)
     skins = {k: fit_influences(mesh.vertices, weights, motion, posed, k, mesh.length) for k in influences}
     return Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts, skins)
 

@@ -123,29 +123,37 @@ def build_skeleton(
     weights: np.ndarray,
     vertices: np.ndarray,
     inside: Callable[[np.ndarray], np.ndarray] | None = None,
+    parents: np.ndarray | None = None,
 ) -> Skeleton:
-    """Join the model's bones into a tree.
+    """Join the model's bones into a tree: the model's own, or for loose bones the one of least cost.
 
-    The root is the bone from which the others, weighted by the surface they move, are nearest along the tree.
+    The root of loose bones is the one from which the others, weighted by the surface they move, are nearest.
 
     Args:
         centres: (B, 3) of the bones at rest, canonical space.
         transforms: (T, B, 4, 4) canonical to posed, over all clips.
         weights: (V, B) skinning weights at rest.
         vertices: (V, 3) surface at rest.
+        parents: (B,) the model's own tree, a root being its own parent; None for loose bones.
         inside: tells which of points (N, 3) lie in the body; joints outside are drawn in between their bones.
     """
     centres = centres.astype(np.float64)
     count = len(centres)
     cost, point = pair_joints(centres, transforms.astype(np.float64), float(np.ptp(vertices, axis=0).max()))
-    # Bones that share skin belong together: overlap makes an edge up to a third cheaper.
-    overlap = weights.T @ weights
-    overlap = overlap / np.sqrt(np.maximum(np.outer(np.diag(overlap), np.diag(overlap)), 1e-12))
-    cost = np.maximum(cost * (1 - overlap / 3), 1e-9) * (1 - np.eye(count))
-    tree = sparse.csgraph.minimum_spanning_tree(sparse.csr_matrix(cost))
-    along = sparse.csgraph.shortest_path(tree, directed=False)
-    root = int((along @ (weights.mean(axis=0) + 1e-6)).argmin())
-    order, before = sparse.csgraph.breadth_first_order(tree, root, directed=False)
+    if parents is None:
+        # Bones that share skin belong together: overlap makes an edge up to a third cheaper.
+        overlap = weights.T @ weights
+        overlap = overlap / np.sqrt(np.maximum(np.outer(np.diag(overlap), np.diag(overlap)), 1e-12))
+        cost = np.maximum(cost * (1 - overlap / 3), 1e-9) * (1 - np.eye(count))
+        tree = sparse.csgraph.minimum_spanning_tree(sparse.csr_matrix(cost))
+        tree = tree + tree.T
+        along = sparse.csgraph.shortest_path(tree, directed=False)
+        root = int((along @ (weights.mean(axis=0) + 1e-6)).argmin())
+    else:
+        child = np.flatnonzero(parents != np.arange(count))
+        root = int(np.flatnonzero(parents == np.arange(count))[0])
+        tree = sparse.csr_matrix((np.ones(len(child)), (parents[child], child)), shape=(count, count))
+    order, before = sparse.csgraph.breadth_first_order(tree, root)
     position = np.empty(count, np.int64)
     position[order] = np.arange(count)
     parent_bone = np.where(before[order] < 0, order, before[order])

@@ -71,6 +71,17 @@ def test_bones_that_do_not_move_apart_are_joined_in_the_middle() -> None:
     np.testing.assert_allclose(point[0, 1], [0.5, 0, 0], atol=1e-12)
 
 
+def test_a_models_own_tree_is_kept() -> None:
+    centres, transforms, _ = star(10, 1)
+    vertices = np.repeat(centres, 4, axis=0)
+    parents = np.array([1, 3, 2, 2, 3, 2, 5])  # not the cheapest one, and not in order
+    skeleton = build_skeleton(centres, transforms, nearest_bone_weights(vertices, centres), vertices, parents=parents)
+    assert skeleton.bone[0] == 2
+    for j, b in enumerate(skeleton.bone[1:], start=1):
+        assert skeleton.bone[skeleton.parent[j]] == parents[b]
+        assert skeleton.parent[j] < j
+
+
 def test_one_bone_is_a_tree() -> None:
     vertices = np.random.default_rng(0).normal(size=(10, 3))
     skeleton = build_skeleton(np.zeros((1, 3)), np.tile(np.eye(4), (3, 1, 1, 1)), np.ones((10, 1)), vertices)

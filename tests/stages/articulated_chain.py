@@ -32,6 +32,10 @@ class Chain:
         return centres
 
     @property
+    def bone_parents(self) -> Tensor | None:
+        return None
+
+    @property
     def bone_orientations(self) -> Tensor:
         angle = torch.linspace(0.1, 0.9, self.count)  # any frame will do: the rig must not care
         c, s, zero, one = angle.cos(), angle.sin(), torch.zeros(self.count), torch.ones(self.count)
