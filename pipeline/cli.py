@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import re
 import signal
 import sys
@@ -194,6 +195,9 @@ def options_of(args: argparse.Namespace, overrides: list[tuple[str, str]]) -> Op
 def main(argv: list[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         rest, overrides = split_overrides(words)
         parser = build_parser()

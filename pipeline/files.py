@@ -70,7 +70,12 @@ def read_json(path: Path) -> Any:
 
 def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
     """Write JSON atomically; NaN is refused."""
-    write_atomic(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n", durable=durable)
+    text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # names of files that are not UTF-8
+        text = json.dumps(value, indent=1, allow_nan=False)
+    write_atomic(path, text + "\n", durable=durable)
 
 
 def sha256_file(path: Path) -> str:

@@ -257,7 +257,8 @@ def _versions() -> dict[str, str]:
     found = {"python": sys.version.split()[0]}
     for name, module in sorted(sys.modules.items()):
         version = getattr(module, "__version__", None)
-        if "." not in name and not name.startswith("_") and isinstance(version, str):
+        ours = "." in name or name.startswith("_") or name in sys.stdlib_module_names
+        if not ours and isinstance(version, str):
             found[name] = version
     return found
 
