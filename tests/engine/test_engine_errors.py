@@ -198,7 +198,16 @@ def test_two_videos_with_one_stem_are_both_named(lab: Lab) -> None:
 
 def test_strange_names(lab: Lab) -> None:
     clear(lab.clips)
-    names = ["-rf.mp4", "my cat (1).mp4", "my-cat-1-.mp4", "..hidden..mp4", "a\nb.mov", "猫 と 犬.mkv", "Ünï.AVI", "x" * 200 + ".gif"]
+    names = [
+        "-rf.mp4",
+        "my cat (1).mp4",
+        "my-cat-1-.mp4",
+        "..hidden..mp4",
+        "a\nb.mov",
+        "猫 と 犬.mkv",
+        "Ünï.AVI",
+        "x" * 200 + ".gif",
+    ]
     names = [n for n in names if not n.startswith("..")] + ["a..b.mp4", "$(rm -rf *).mp4", "'\";.mp4"]
     for name in names:
         (lab.clips / name).write_text(name)
@@ -257,7 +266,11 @@ def test_unreadable_is_said_in_one_sentence(lab: Lab, monkeypatch: pytest.Monkey
 
 
 def test_a_video_that_changes_while_it_is_read(lab: Lab) -> None:
-    lab.edit("words.py", "    hint = given", '    video.path.write_text("changed") if run.video == "cat" else 0\n    hint = given')
+    lab.edit(
+        "words.py",
+        "    hint = given",
+        '    video.path.write_text("changed") if run.video == "cat" else 0\n    hint = given',
+    )
     outcome = lab.run("--until", "words")
     assert outcome.code == 2 and "it changed while it was being read" in outcome.err
     assert set(lab.records()) == {"words/dog"}

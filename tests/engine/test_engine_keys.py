@@ -96,7 +96,9 @@ def edited(package: Path, name: str, old: str, new: str) -> set[str]:
 def test_comments_docstrings_and_layout_do_not_count(package: Path) -> None:
     assert edited(package, "shouting.py", "  # loud", "  # very loud indeed") == set()
     assert edited(package, "shouting.py", '    """Upper case and a mark."""\n', '    """Otherwise put."""\n') == set()
-    assert edited(package, "shouting.py", "text.upper() + mark", "(\n        text.upper()\n        + mark\n    )") == set()
+    assert (
+        edited(package, "shouting.py", "text.upper() + mark", "(\n        text.upper()\n        + mark\n    )") == set()
+    )
     assert edited(package, "words.py", '    """How many files to make."""\n', "\n\n") == set()
     assert edited(package, "shouting.py", "def shout", "\n\n\n# a remark\ndef shout") == set()
 

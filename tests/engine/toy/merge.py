@@ -23,9 +23,7 @@ class MergeSettings:
 
 
 @stage(per=Scene, needs=Resources(cpus="all", gpus=1))
-def merge(
-    upper: dict[str, Folder], measure: dict[str, Folder], settings: MergeSettings, out: Path, run: Run
-) -> None:
+def merge(upper: dict[str, Folder], measure: dict[str, Folder], settings: MergeSettings, out: Path, run: Run) -> None:
     """Everything together."""
     state = run.checkpoint_dir / "step.txt"
     first = int(state.read_text()) if state.exists() else 0
