@@ -54,6 +54,8 @@ class FrameState(NamedTuple):
 
     transforms: Tensor
     """J (F, B, 4, 4), canonical to object space."""
+    shift: Tensor
+    """Each bone's own shift against its parent (F, B, 3)."""
     inverse: Tensor
     """J^-1 (F, B, 4, 4)."""
     posed_coefficients: Tensor
@@ -136,12 +138,13 @@ class Banmo(nn.Module):
 
     def state_at(self, video_idx: Tensor, time: Tensor, base: Tensor) -> FrameState:
         """Frame state at normalised `time` (F,) of videos (F,), with initial root poses `base` (F, 4, 4)."""
-        transforms, code = self.body(video_idx, time, self.bones.centres)
+        transforms, shift, code = self.body(video_idx, time, self.bones.centres, self.bones.parents)
         rest = score_coefficients(self.bones.centres, self.bones.orientations, self.bones.log_scales)[None]
         centres = (transforms[..., :3, :3] @ self.bones.centres[..., None]).squeeze(-1) + transforms[..., :3, 3]
         posed = score_coefficients(centres, transforms[..., :3, :3] @ self.bones.orientations, self.bones.log_scales)
         return FrameState(
             transforms=transforms,
+            shift=shift,
             inverse=invert_rigid(transforms),
             posed_coefficients=posed,
             rest_coefficients=rest,
@@ -205,7 +208,7 @@ class Banmo(nn.Module):
             videos,
             tensors["base_poses"],
             torch.tensor(description["bounds"]),
-            Bones(torch.zeros(count, 3), torch.zeros(count, 3)),
+            Bones(torch.zeros(count, 3), torch.zeros(count, 3), tensors["bones.parents"]),
             torch.Generator().manual_seed(0),
         )
         model.surface = torch.zeros_like(tensors["surface"])
@@ -222,6 +225,11 @@ class Banmo(nn.Module):
     def bone_centres(self) -> Tensor:
         """(B, 3), canonical space."""
         return self.bones.centres.detach()
+
+    @property
+    def bone_parents(self) -> Tensor:
+        """(B,) int64: parent of each bone, before it in the list; the root is its own."""
+        return self.bones.parents
 
     @property
     def bone_orientations(self) -> Tensor:

@@ -65,7 +65,12 @@ class MotionHead(nn.Module):
 
 
 class BodyPose(nn.Module):
-    """Bone transforms J_b(t), canonical to object space, from the body pose code omega_b (equations 4, 5)."""
+    """Bone transforms J_b(t), canonical to object space, from the body pose code omega_b (equations 4, 5).
+
+    The paper's bones move freely. Ours turn about the joint with their parent, half way between the two centres,
+    and inherit its motion; a small shift of their own remains. So limbs swing rather than stretch, which is what
+    lets a limb be found before it is well modelled, and the tree is the rig that is exported.
+    """
 
     def __init__(
         self, videos: int, bones: int, octaves: int, code: int, width: int, generator: torch.Generator
@@ -74,13 +79,35 @@ class BodyPose(nn.Module):
         self.code = FourierCode(videos, code, octaves, generator)
         self.head = MotionHead(code, bones, width, translation_scale=0.3)
 
-    def forward(self, video_idx: Tensor, time: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
-        """J (N, B, 4, 4) at `time` (N,), and the codes (N, C). A bone turns about its own centre (B, 3)."""
+    def forward(
+        self, video_idx: Tensor, time: Tensor, centres: Tensor, parents: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """J (N, B, 4, 4) at `time` (N,), shifts (N, B, 3) and codes (N, C) of bones at `centres` (B, 3)."""
         code = self.code(video_idx, time)
         vectors, shift = self.head(code)
         rotation = so3_exp(vectors)
-        offset = centres - (rotation @ centres[..., None]).squeeze(-1) + shift
-        return rigid(rotation, offset), code
+        joints = (centres + centres[parents]) / 2
+        local = rigid(rotation, joints - (rotation @ joints[..., None]).squeeze(-1) + shift)
+        return chain(local, parents), shift, code
+
+
+def chain(local: Tensor, parents: Tensor) -> Tensor:
+    """Compose transforms relative to the parent (N, B, 4, 4) along a tree (B,) whose parents come first."""
+    depth = [0] * len(parents)
+    for bone, parent in enumerate(parents.tolist()):
+        depth[bone] = 0 if parent == bone else depth[parent] + 1
+    composed: list[Tensor] = [local[:, 0]] * len(parents)
+    for level in range(max(depth) + 1):
+        members = [bone for bone, d in enumerate(depth) if d == level]
+        if level == 0:
+            for bone in members:
+                composed[bone] = local[:, bone]
+            continue
+        above = torch.stack([composed[int(parents[bone])] for bone in members], 1)
+        here = above @ local[:, members]
+        for i, bone in enumerate(members):
+            composed[bone] = here[:, i]
+    return torch.stack(composed, 1)
 
 
 class RootPose(nn.Module):

@@ -5,6 +5,8 @@ Depths are z in camera space along directions with unit z. Axes: ray R, sample S
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,16 @@ def laplace_density(sdf: Tensor, beta: Tensor | float) -> Tensor:
     beta = torch.as_tensor(beta, dtype=sdf.dtype, device=sdf.device)
     tail = 0.5 * torch.exp(-sdf.abs() / beta)
     return torch.where(sdf > 0, tail, 1 - tail) / beta
+
+
+def edge_offset(beta: float, radius: float = 0.1) -> float:
+    """How far outside the zero level a silhouette's edge (opacity one half) would lie, in units.
+
+    A ray that passes a surface of curvature `radius` at distance d gathers about
+    ``exp(-d / beta) / (2 beta) * sqrt(2 pi radius beta)`` of optical depth; it is ln 2 at the offset. Rendering the
+    field shifted by it puts the silhouette on the zero level, so that shapes do not come out thin.
+    """
+    return beta * math.log(max(math.sqrt(2 * math.pi * radius / beta) / (2 * math.log(2)), 1.0))
 
 
 def ray_weights(density: Tensor, lengths: Tensor) -> Tensor:

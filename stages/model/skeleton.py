@@ -19,10 +19,14 @@ from stages.geometry.rotations import quaternion_to_matrix
 
 
 class Bones(nn.Module):
-    """B Gaussian bones: ``centres`` (B, 3), ``quaternions`` (B, 4), ``log_scales`` (B, 3)."""
+    """B Gaussian bones: ``centres`` (B, 3), ``quaternions`` (B, 4), ``log_scales`` (B, 3), ``parents`` (B,) int64.
 
-    def __init__(self, centres: Tensor, log_scales: Tensor) -> None:
+    Bones hang in a tree, listed so that a parent comes before its children; the first is the root, its own parent.
+    """
+
+    def __init__(self, centres: Tensor, log_scales: Tensor, parents: Tensor) -> None:
         super().__init__()
+        self.register_buffer("parents", parents.clone().long())
         self.centres = nn.Parameter(centres.clone())
         identity = torch.tensor([1.0, 0, 0, 0]).expand(len(centres), 4)
         self.quaternions = nn.Parameter(identity.clone())
@@ -35,6 +39,42 @@ class Bones(nn.Module):
     def orientations(self) -> Tensor:
         """(B, 3, 3): columns are the Gaussians' principal axes."""
         return quaternion_to_matrix(self.quaternions)
+
+
+def bone_tree(distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Order (B,) and parents (B,) of a tree over bones at mutual `distance` (B, B): the minimum spanning tree.
+
+    The root is the bone whose farthest bone along the tree is nearest. ``order[i]`` is the old index of new bone i;
+    ``parents[i]`` is the new index of its parent, smaller than i.
+    """
+    count = len(distance)
+    linked = [0]
+    edges: list[list[int]] = [[] for _ in range(count)]
+    best, source = distance[0].clone(), torch.zeros(count, dtype=torch.int64)
+    best[0] = torch.inf
+    while len(linked) < count:
+        new = int(best.argmin())
+        edges[new].append(int(source[new]))
+        edges[int(source[new])].append(new)
+        linked.append(new)
+        closer = distance[new] < best
+        source[closer] = new
+        best = torch.minimum(best, distance[new])
+        best[linked] = torch.inf
+
+    def walk(root: int) -> tuple[list[int], dict[int, int], float]:
+        order, parent, far = [root], {root: root}, {root: 0.0}
+        for node in order:
+            for other in edges[node]:
+                if other not in parent:
+                    parent[other], far[other] = node, far[node] + float(distance[node, other])
+                    order.append(other)
+        return order, parent, max(far.values())
+
+    root = min(range(count), key=lambda b: walk(b)[2])
+    order, parent, _ = walk(root)
+    place = {old: new for new, old in enumerate(order)}
+    return torch.tensor(order), torch.tensor([place[parent[old]] for old in order])
 
 
 def monomials(points: Tensor) -> Tensor:

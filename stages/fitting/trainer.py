@@ -1,0 +1,154 @@
+"""The loop of one phase: a step, its schedule, what it remembers. State in, state out; no files.
+
+Resuming is exact: all randomness comes from (seed, step), and everything a step reads beside the observations is in
+:meth:`Trainer.state`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from stages.fitting.batches import draw, step_generator
+from stages.fitting.objective import evaluate
+from stages.fitting.observations import Observations
+from stages.fitting.schedule import PhaseSettings, beta_at, rate_at
+from stages.fitting.surface import frame_boxes, surface_points
+from stages.model.banmo import Banmo
+
+
+class Diverged(RuntimeError):
+    """The objective is not finite any more; `term` names the loss that broke first."""
+
+    def __init__(self, step: int, term: str) -> None:
+        super().__init__(f"the loss '{term}' is not finite at step {step}")
+        self.step, self.term = step, term
+
+
+class Trainer:
+    """One phase of the optimisation of `model` on `observations`."""
+
+    def __init__(self, model: Banmo, observations: Observations, settings: PhaseSettings) -> None:
+        self.model, self.observations, self.settings = model, observations, settings
+        self.step_idx = 0
+        self.rate_scale = 1.0
+        model.use_delta = model.use_delta or settings.delta_from <= 0
+        self.refresh()
+        self.optimiser = self._optimiser()
+
+    # ------------------------------------------------------------------------------------------ parameters
+
+    def groups(self) -> dict[str, tuple[list[torch.nn.Parameter], float]]:
+        """Parameter groups by name, with their step sizes."""
+        m, s = self.model, self.settings
+        sdf, colour = [], []
+        for name, parameter in m.field.named_parameters():
+            appearance = ("colour", "embedding", "environment", "appearance")
+            (colour if name.startswith(appearance) else sdf).append(parameter)
+        return {
+            "sdf": (sdf, s.lr_sdf),
+            "colour": (colour, s.lr_colour),
+            "environment": (list(m.environment.parameters()), s.lr_motion if s.lr_colour else 0.0),
+            "motion": (list(m.body.parameters()), s.lr_motion),
+            "bones": (list(m.bones.parameters()), s.lr_bones),
+            "root": (list(m.root.parameters()), s.lr_root),
+            "focal": ([m.log_focal], s.lr_focal),
+            "delta": (list(m.delta.parameters()), s.lr_delta),
+        }
+
+    def _optimiser(self) -> torch.optim.Adam:
+        groups = []
+        for name, (parameters, rate) in self.groups().items():
+            for parameter in parameters:
+                parameter.requires_grad_(rate > 0)
+            if rate > 0:
+                groups.append({"params": parameters, "lr": rate, "base": rate, "name": name})
+        return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
+
+    # ------------------------------------------------------------------------------------------ steps
+
+    @property
+    def progress(self) -> float:
+        """Share of the phase done, 0..1."""
+        return self.step_idx / max(1, self.settings.iterations)
+
+    @property
+    def done(self) -> bool:
+        """Whether every step has been made."""
+        return self.step_idx >= self.settings.iterations
+
+    def refresh(self) -> None:
+        """Extract the surface anew and each frame's box around it: near and far planes, matching bounds."""
+        points = surface_points(self.model)
+        if len(points) >= 100:
+            self.model.surface = points
+        self.boxes = frame_boxes(self.model)
+
+    def step(self) -> dict[str, float]:
+        """One step of descent; returns the weighted value of each term.
+
+        Raises :class:`Diverged` before anything is updated.
+        """
+        s, model = self.settings, self.model
+        if self.step_idx and self.step_idx % s.update_bounds_every == 0:
+            self.refresh()
+        if self.progress >= s.delta_from:
+            model.use_delta = True
+        generator = step_generator(s.seed, self.step_idx)
+        batch = draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator)
+        beta = max(beta_at(s, self.progress), model.beta_floor)
+        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator)
+        total = torch.stack(list(terms.values())).sum()
+        if not torch.isfinite(total):
+            broken = next((name for name, value in terms.items() if not torch.isfinite(value)), "total")
+            raise Diverged(self.step_idx, broken)
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        rate = rate_at(s, self.step_idx) * self.rate_scale
+        frozen = self.progress < s.sdf_frozen_until
+        for group in self.optimiser.param_groups:
+            group["lr"] = 0.0 if frozen and group["name"] == "sdf" else group["base"] * rate
+            torch.nn.utils.clip_grad_norm_(group["params"], 10.0)
+        self.optimiser.step()
+        self.step_idx += 1
+        values = {name: float(value.detach()) for name, value in terms.items()}
+        values["total"] = float(total.detach())
+        return values
+
+    # ------------------------------------------------------------------------------------------ state
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors a resume needs: model, optimiser moments, boxes, counters."""
+        out = {f"model.{k}": v.clone() for k, v in self.model.state_dict().items()}
+        out["boxes"] = self.boxes.clone()
+        out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta)])
+        out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
+        for g, group in enumerate(self.optimiser.param_groups):
+            for p, parameter in enumerate(group["params"]):
+                moments = self.optimiser.state.get(parameter, {})
+                for key, value in moments.items():
+                    out[f"adam.{g}.{p}.{key}"] = torch.as_tensor(value).clone()
+        return out
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Continue from what :meth:`state` gave, bit for bit."""
+        tensors = {k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")}
+        self.model.surface = torch.zeros_like(tensors["surface"])
+        self.model.load_state_dict(tensors)
+        self.boxes = state["boxes"].clone()
+        self.step_idx = int(state["counters"][0])
+        self.model.use_delta = bool(state["counters"][1])
+        self.rate_scale = float(state["rate_scale"][0])
+        self.optimiser = self._optimiser()
+        for g, group in enumerate(self.optimiser.param_groups):
+            for p, parameter in enumerate(group["params"]):
+                prefix = f"adam.{g}.{p}."
+                moments = {k.removeprefix(prefix): v.clone() for k, v in state.items() if k.startswith(prefix)}
+                if moments:
+                    self.optimiser.state[parameter] = moments
+
+    def finite(self) -> bool:
+        """Whether every parameter is finite."""
+        return all(math.isfinite(float(p.detach().abs().sum())) for p in self.model.parameters())
