@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import io
 import re
@@ -16,6 +17,9 @@ from pipeline.project import Options
 
 _EXIT_CODES = """exit codes: 0 done · 1 an action failed · 2 usage, settings or input at fault · 3 a decision is needed
             4 damage found · 10 work pending (--check) · 75 stopped, resumable · 130 stopped by Ctrl-C"""
+
+# What the user can mend: no space, no permission, a read-only disk. Any other OSError is a fault of the program.
+_USERS_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
 
 _SETTINGS_HELP = "any setting of a stage: --STAGE.KEY VALUE (see `banmo settings`)"
 
@@ -218,6 +222,11 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 128 + signal.SIGPIPE
+    except OSError as error:
+        if error.errno not in _USERS_ERRNOS:
+            raise
+        sys.stderr.write(f"banmo: {BadInput(str(error.strerror), where=error.filename or 'the disk')}\n")
+        return ExitCode.USAGE
 
 
 def _flag_hint(parser: argparse.ArgumentParser, verb: str, word: str) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput, StageError, did_you_mean
-from pipeline.files import read_json, write_json
+from pipeline.files import read_json, write_memo
 from pipeline.source import Code, CodeReader
 
 _ENGINE_ROOT = Path(__file__).resolve().parent.parent
@@ -162,7 +162,7 @@ def _describe_all(folder: Path, references: list[str], reader: CodeReader, cache
         for reference, value in _ask(folder, stale).items():
             described[reference] = value
             if cache and "error" not in value:
-                write_json(cache / "contracts" / f"{keys[reference]}.json", value)
+                write_memo(cache / "contracts" / f"{keys[reference]}.json", value)
     infos = []
     for reference in references:
         name = reference.partition(":")[2]

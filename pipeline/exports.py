@@ -26,17 +26,17 @@ def export(project: Project, planner: Planner, to: Path | None = None) -> Path |
     if len(records) < len(nodes):
         return None
     target = to or project.workspace.exports
+    if _is_there(target, records):
+        return target
     with project.workspace.exclusive():
         _export(project, planner, records, target)
     return target
 
 
 def _export(project: Project, planner: Planner, records: dict[str | None, Record], target: Path) -> None:
-    wanted = {video or "": record.digest for video, record in records.items()}
-    before = read_json(target / PROVENANCE)
-    before = before if isinstance(before, dict) and isinstance(before.get("files"), dict) else {"files": {}}
-    if before.get("digests") == wanted and _complete(target, before["files"]):
+    if _is_there(target, records):
         return
+    wanted, before = _wanted(records), _before(target)
     fresh = target.with_name(f".{target.name}-{unique()}")
     try:
         fresh.mkdir(parents=True)
@@ -54,6 +54,21 @@ def _export(project: Project, planner: Planner, records: dict[str | None, Record
         remove_tree(retired)
     finally:
         remove_tree(fresh)
+
+
+def _wanted(records: dict[str | None, Record]) -> dict[str, str]:
+    return {video or "": record.digest for video, record in records.items()}
+
+
+def _before(target: Path) -> dict[str, Any]:
+    """What an earlier export says of itself."""
+    value = read_json(target / PROVENANCE)
+    return value if isinstance(value, dict) and isinstance(value.get("files"), dict) else {"files": {}}
+
+
+def _is_there(target: Path, records: dict[str | None, Record]) -> bool:
+    before = _before(target)
+    return before.get("digests") == _wanted(records) and _complete(target, before["files"])
 
 
 def _copy(source: Path, target: Path) -> None:

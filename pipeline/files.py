@@ -78,6 +78,12 @@ def write_json(path: Path, value: Any, *, durable: bool = False) -> None:
     write_atomic(path, text + "\n", durable=durable)
 
 
+def write_memo(path: Path, value: Any) -> None:
+    """Write JSON that only saves time later; a store that cannot be written to does without."""
+    with contextlib.suppress(OSError):
+        write_json(path, value)
+
+
 def sha256_file(path: Path) -> str:
     """SHA-256 of a file's content."""
     digest = hashlib.sha256()

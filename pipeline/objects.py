@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import StageError, printable
-from pipeline.files import failpoint, read_json, remove_tree, sha256_file, sync_folder, unique, write_atomic, write_json
+from pipeline.files import failpoint, read_json, remove_tree, sha256_file, sync_folder, unique, write_atomic, write_memo
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Objects:
     def _remember(self, kind: str, digest: str) -> None:
         signature = self._signature(kind, digest)
         if signature is not None:
-            write_json(self._memo(kind, digest), {"signature": signature})
+            write_memo(self._memo(kind, digest), {"signature": signature})
 
     def _signature(self, kind: str, digest: str) -> str | None:
         folder = self.path(kind, digest)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput, StageError
-from pipeline.files import read_json, sha256_file, signature, write_json
+from pipeline.files import read_json, sha256_file, signature, write_memo
 
 _NAMING = {"PIPELINE", "GROUPS", "PRESETS"}
 _MEMO_FORMAT = 2
@@ -84,7 +84,7 @@ class CodeReader:
     def save(self) -> None:
         """Keep the memo for the next command."""
         if self._memo_path is not None and self._dirty:
-            write_json(self._memo_path, {"format": _MEMO_FORMAT, "files": self._memo})
+            write_memo(self._memo_path, {"format": _MEMO_FORMAT, "files": self._memo})
             self._dirty = False
 
     def _data_files(self, pattern: str) -> list[Path]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput, printable
-from pipeline.files import read_json, sha256_file, signature, write_json
+from pipeline.files import read_json, sha256_file, signature, write_memo
 
 VIDEO_EXTENSIONS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".gif")
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -179,7 +179,7 @@ class SourceDigests:
     def save(self) -> None:
         """Keep the memo for the next command."""
         if self._path is not None and self._dirty:
-            write_json(self._path, self._memo)
+            write_memo(self._path, self._memo)
             self._dirty = False
 
     def _file(self, path: Path) -> str:

@@ -26,7 +26,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from pipeline.errors import BadInput
-from pipeline.files import read_json, remove_tree, write_atomic, write_json
+from pipeline.files import read_json, remove_tree, write_atomic, write_memo
 from pipeline.ledger import Ledger
 from pipeline.objects import Objects
 
@@ -97,7 +97,7 @@ class Workspace:
     def remember(self, value: dict[str, Any]) -> None:
         """Keep them for later commands."""
         if value != self.remembered():
-            write_json(self.root / "inputs.json", value)
+            write_memo(self.root / "inputs.json", value)
 
     # ------------------------------------------------------------------ locks
 
