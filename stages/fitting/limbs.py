@@ -120,8 +120,10 @@ def limb_voxels(
     sigma = 0.03 * mask.shape[0]
     weight = gaussian_filter(reach.astype(np.float32), sigma) + 1e-6
     smooth = np.stack([gaussian_filter(cost[..., b], sigma) for b in range(bins)], -1) / weight[..., None]
-    # Where no frame votes (a limb's far end), the depth of the body that it hangs on.
-    smooth += 0.15 * np.exp(-((edges - _nearest_depth(camera, pixels, body, mask.shape)[..., None]) ** 2) / 0.045)
+    # Near the body, and where no frame votes (a limb's far end), the depth of the body that it hangs on.
+    hang, away_px = _nearest_depth(camera, pixels, body, mask.shape)
+    pull = 0.15 + np.exp(-away_px / (0.04 * mask.shape[0]))
+    smooth += pull[..., None] * np.exp(-((edges - hang[..., None]) ** 2) / 0.045)
     power = np.maximum(smooth, 0) ** 6  # a soft argmax: the densest depths win, neighbours agree
     centre = (power * edges).sum(-1) / np.maximum(power.sum(-1), 1e-12)
 
@@ -137,16 +139,16 @@ def limb_voxels(
     return solid.reshape(body.solid.shape) & near
 
 
-def _nearest_depth(camera: Tensor, pixels: np.ndarray, body: Hull, shape: tuple[int, ...]) -> np.ndarray:
-    """Mean depth (h, w) of the body at each pixel; at the nearest pixel that shows the body elsewhere."""
+def _nearest_depth(camera: Tensor, pixels: np.ndarray, body: Hull, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean depth (h, w) of the body at each pixel, elsewhere at the nearest pixel that shows it; and how far that is."""
     solid = body.solid.reshape(-1).numpy()
     cell = np.floor(pixels[solid]).astype(int)
     ok = ((cell >= 0) & (cell < np.array(shape[::-1]))).all(1)
     total, count = np.zeros(shape), np.zeros(shape)
     np.add.at(total, (cell[ok, 1], cell[ok, 0]), camera[torch.from_numpy(solid), 2].numpy()[ok])
     np.add.at(count, (cell[ok, 1], cell[ok, 0]), 1)
-    nearest = distance_transform_edt(count == 0, return_distances=False, return_indices=True)
-    return (total / np.maximum(count, 1))[tuple(nearest)]
+    away, nearest = distance_transform_edt(count == 0, return_indices=True)
+    return (total / np.maximum(count, 1))[tuple(nearest)], away
 
 
 def attach(body: Hull, limbs: np.ndarray) -> Hull:

@@ -254,7 +254,9 @@ def motion_terms(
         jerk = torch.sqrt((p[:, 0] - 2 * p[:, 1] + p[:, 2]).square().sum(-1) + 1e-6).mean(-1)
         terms["motion"] = settings.weight_motion * (jerk * whole).mean()
     if settings.weight_root and settings.lr_root:
-        roots = model.root(model.video_idx[flat], model.time[flat], model.base_poses[flat]).reshape(*triple.shape, 4, 4)
+        v = model.video_idx[flat]
+        roots = model.root(v, model.time[flat], model.base_poses[flat], model.root_free[v])
+        roots = roots.reshape(*triple.shape, 4, 4)
         rotation = roots[..., :3, :3]
         first = so3_log(rotation[:, 0].transpose(1, 2) @ rotation[:, 1])
         second = so3_log(rotation[:, 1].transpose(1, 2) @ rotation[:, 2])

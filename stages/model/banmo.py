@@ -103,6 +103,7 @@ class Banmo(nn.Module):
         self.log_focal = nn.Parameter(torch.zeros(count))
         self.register_buffer("base_poses", base_poses.clone().float())
         self.register_buffer("surface", torch.zeros(0, 3))
+        self.register_buffer("root_free", torch.ones(count))  # 0 holds a video's root poses where they were given
 
         # Kept as plain tensors, rebuilt from `videos`: times in seconds need float64 to stay exact on disk.
         self.starts = [0]
@@ -149,7 +150,7 @@ class Banmo(nn.Module):
             posed_coefficients=posed,
             rest_coefficients=rest,
             code=code,
-            camera_from_object=self.root(video_idx, time, base),
+            camera_from_object=self.root(video_idx, time, base, self.root_free[video_idx]),
             intrinsics=self.intrinsics_of(video_idx),
             environment=self.environment(video_idx, time),
         )

@@ -122,8 +122,11 @@ class RootPose(nn.Module):
         self.code = FourierCode(videos, code, octaves, generator)
         self.head = MotionHead(code, 1, width, translation_scale=0.3)
 
-    def forward(self, video_idx: Tensor, time: Tensor, base: Tensor) -> Tensor:
-        """Root poses (N, 4, 4), camera_from_object, from `base` poses (N, 4, 4) at `time` (N,)."""
+    def forward(self, video_idx: Tensor, time: Tensor, base: Tensor, free: Tensor) -> Tensor:
+        """Root poses (N, 4, 4), camera_from_object, from `base` poses (N, 4, 4) at `time` (N,).
+
+        `free` (N,) in 0..1 scales the correction; zero leaves the base pose as it is.
+        """
         vectors, shift = self.head(self.code(video_idx, time))
-        rotation = so3_exp(vectors[:, 0]) @ base[:, :3, :3]
-        return rigid(rotation, base[:, :3, 3] + shift[:, 0])
+        rotation = so3_exp(vectors[:, 0] * free[:, None]) @ base[:, :3, :3]
+        return rigid(rotation, base[:, :3, 3] + shift[:, 0] * free[:, None])

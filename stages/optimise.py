@@ -1,0 +1,305 @@
+"""optimise: the paper's three phases, each a stage: fit everything, correct the articulation, refine the details.
+
+``fit`` starts from root poses and masks, ``correct`` and ``refine`` from the phase before. Each folder holds
+``model.safetensors``, ``model.json``, ``poses/<video>.json``, ``metrics.jsonl`` and ``previews/*.png``. A phase that
+is stopped continues from its last checkpoint, bit for bit on a CPU.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipeline import Folder, Resources, Run, Scene, stage
+from stages import formats
+from stages.checkpoint import Checkpoints
+from stages.collect import Collection, collect
+from stages.fitting import initialise
+from stages.fitting.begin import Beginning, first_model
+from stages.fitting.preview import preview_sheet
+from stages.fitting.schedule import PhaseSettings
+from stages.fitting.trainer import Diverged, Trainer
+from stages.model.banmo import Architecture, Banmo
+from stages.model.skeleton import Bones
+
+_CHECKPOINT_STEPS = 50
+_METRIC_STEPS = 10
+
+
+@dataclass(frozen=True)
+class FitSettings(PhaseSettings):
+    """Phase 1: shape, colour, bones, motion, and root poses unless they were given."""
+
+    representation: str = "grid"
+    """grid (dense grids, quick on a CPU) or mlp (the paper's networks)."""
+    voxel: float = 0.024
+    """Spacing of the finest grid (object about 2 long)."""
+    mlp_depth: int = 8
+    """Layers of the trunk when representation = mlp."""
+    mlp_width: int = 256
+    """Channels of the trunk when representation = mlp."""
+    bones: int = 25
+    """Number of bones."""
+    start: str = "hull"
+    """hull (soft visual hull of the masks, limbs and motion first) or sphere (the paper's)."""
+    limb_rounds: int = 2
+    """How often limbs that the hull missed are looked for."""
+    motion_iterations: int = 150
+    """Steps of each fit of the motion to the masks before rendering begins."""
+    motion_period_s: float = 0.25
+    """Fastest motion that the pose codes can follow."""
+    flow_steps: tuple[int, ...] = (1, 4)
+    """Frame steps of the optical flow that are used, both ways."""
+    lr_root: float = 1e-3
+    """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
+
+
+@dataclass(frozen=True)
+class CorrectSettings(PhaseSettings):
+    """Phase 2: articulation alone, by matching pixels to the surface and back (2D cycle); the shape is held."""
+
+    iterations: int = 80
+    """Steps of gradient descent."""
+    lr_sdf: float = 0.0
+    """Step size of the signed distance."""
+    lr_colour: float = 0.0
+    """Step size of colour and embedding grids."""
+    lr_bones: float = 0.0
+    """Step size of the bones' centres, axes and sizes."""
+    lr_motion: float = 1e-3
+    """Step size of body pose codes and head."""
+    lr_delta: float = 0.0
+    """Step size of the learned skinning correction."""
+    beta_start: float = 0.012
+    """Width of the Laplace density at the start (object about 2 long)."""
+    weight_cycle_2d: float = 0.1
+    """Matched point projected back onto its pixel (L_2D-cyc), in image sizes."""
+    match_every: int = 1
+    """Matching and the 2D cycle run every so many steps."""
+    flow_steps: tuple[int, ...] = (1, 4)
+    """Frame steps of the optical flow that are used, both ways."""
+
+
+@dataclass(frozen=True)
+class RefineSettings(PhaseSettings):
+    """Phase 3: details of shape, colour and skinning; root poses are held."""
+
+    iterations: int = 200
+    """Steps of gradient descent."""
+    beta_start: float = 0.012
+    """Width of the Laplace density at the start (object about 2 long)."""
+    beta_end: float = 0.006
+    """Width of the Laplace density at the end: sharp."""
+    lr_sdf: float = 1.5e-3
+    """Step size of the signed distance."""
+    lr_motion: float = 1e-3
+    """Step size of body pose codes and head."""
+    delta_from: float = 0.0
+    """Share of the phase from which skinning is corrected by a network; above 1 = never."""
+    decay_from: float = 0.0
+    """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
+    flow_steps: tuple[int, ...] = (1, 4)
+    """Frame steps of the optical flow that are used, both ways."""
+
+
+@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+def fit(
+    frames: dict[str, Folder],
+    masks: dict[str, Folder],
+    flow: dict[str, Folder],
+    features: dict[str, Folder],
+    poses: Folder,
+    settings: FitSettings,
+    out: Path,
+    run: Run,
+) -> None:
+    """A first whole model of the collection: canonical shape and colour, bones, and the motion of every clip."""
+    torch.set_num_threads(max(1, run.threads))
+    collection = collect(frames, masks, flow, features, poses, settings.flow_steps, run)
+    normal = initialise.normalise(collection.observations, collection.camera_from_object, collection.intrinsics)
+    run.metric("object_scale", normal.scale)
+    checkpoints = Checkpoints(run.checkpoint_dir)
+    saved = checkpoints.latest()
+    if saved is not None:
+        model = Banmo.restore(saved.model_tensors(), saved.description)
+    else:
+        model = _first(collection, normal, settings, run)
+    _run_phase(model, collection, settings, checkpoints, out, run, "fitting")
+
+
+@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+def correct(
+    fit: Folder,
+    frames: dict[str, Folder],
+    masks: dict[str, Folder],
+    flow: dict[str, Folder],
+    features: dict[str, Folder],
+    poses: Folder,
+    settings: CorrectSettings,
+    out: Path,
+    run: Run,
+) -> None:
+    """The same model with its articulation corrected while the shape is held."""
+    _continue(fit, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
+
+
+@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+def refine(
+    correct: Folder,
+    frames: dict[str, Folder],
+    masks: dict[str, Folder],
+    flow: dict[str, Folder],
+    features: dict[str, Folder],
+    poses: Folder,
+    settings: RefineSettings,
+    out: Path,
+    run: Run,
+) -> None:
+    """The final model: sharper shape, corrected skinning."""
+    _continue(correct, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
+
+
+def _first(collection: Collection, normal: initialise.Normalised, settings: FitSettings, run: Run) -> Banmo:
+    architecture = Architecture(
+        representation=settings.representation,
+        voxel=settings.voxel,
+        mlp_depth=settings.mlp_depth,
+        mlp_width=settings.mlp_width,
+        octaves=initialise.octaves(collection.videos, settings.motion_period_s),
+    )
+    free = 1 - collection.root_fixed
+    if settings.start == "sphere":
+        generator = torch.Generator().manual_seed(settings.seed)
+        sphere = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
+        sphere = sphere * 0.5 * torch.rand(4000, 1, generator=generator) ** (1 / 3)
+        model = initialise.build(
+            architecture, collection.videos, normal.camera_from_canonical, sphere, 0.08, settings.bones, settings.seed, 0.7
+        )
+        model.root_free.copy_(free)
+        return model
+    beginning = Beginning(
+        bones=settings.bones, limb_rounds=settings.limb_rounds, motion_iterations=settings.motion_iterations
+    )
+    return first_model(
+        collection.observations,
+        normal.camera_from_canonical,
+        collection.intrinsics,
+        collection.videos,
+        architecture,
+        beginning,
+        settings,
+        free,
+        lambda steps: run.progress(steps, label="motion before rendering"),
+        run.log,
+    )
+
+
+def _continue(before: Folder, collection: Collection, settings: PhaseSettings, out: Path, run: Run) -> None:
+    torch.set_num_threads(max(1, run.threads))
+    checkpoints = Checkpoints(run.checkpoint_dir)
+    saved = checkpoints.latest()
+    if saved is not None:
+        model = Banmo.restore(saved.model_tensors(), saved.description)
+    else:
+        model = Banmo.restore(*formats.read_model(before.path))
+    _run_phase(model, collection, settings, checkpoints, out, run, "optimising")
+
+
+def _run_phase(
+    model: Banmo,
+    collection: Collection,
+    settings: PhaseSettings,
+    checkpoints: Checkpoints,
+    out: Path,
+    run: Run,
+    label: str,
+) -> None:
+    """Train from the last checkpoint to the end, and write the phase's folder."""
+    trainer = Trainer(model, collection.observations, settings)
+    history: list[dict[str, float]] = []
+    saved = checkpoints.latest()
+    if saved is not None:
+        trainer.restore(saved.tensors)
+        history = saved.history
+    else:
+        checkpoints.save(trainer.state(), model.describe(), 0, history)
+    setbacks = 0
+    while not trainer.done:
+        if run.stop_requested:
+            checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
+            run.interrupt()
+        try:
+            values = trainer.step()
+        except Diverged as error:
+            setbacks += 1
+            saved = checkpoints.latest()
+            if setbacks > 3 or saved is None:
+                raise
+            run.warn(f"{error}; continued from step {saved.step} with half the step size")
+            scale = trainer.rate_scale / 2
+            trainer.restore(saved.tensors)
+            trainer.rate_scale, history = scale, saved.history
+            continue
+        if trainer.step_idx % _METRIC_STEPS == 0 or trainer.done:
+            history.append({"step": trainer.step_idx, **{k: round(v, 7) for k, v in values.items()}})
+        run.tick(trainer.step_idx, settings.iterations, label, loss=values["total"])
+        if trainer.step_idx % _CHECKPOINT_STEPS == 0 and not trainer.done:
+            checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
+            _write_preview(model, collection, checkpoints.root / "preview.png")
+    _write_folder(model, collection, history, out)
+    for name, value in history[-1].items() if history else ():
+        if name != "step":
+            run.metric(f"loss_{name}", value)
+
+
+def _write_folder(model: Banmo, collection: Collection, history: list[dict[str, float]], out: Path) -> None:
+    formats.write_model(out, model.state_dict(), model.describe())
+    (out / "poses").mkdir()
+    with torch.no_grad():
+        for i, (name, clip) in enumerate(collection.clips.items()):
+            poses = model.root_poses(i, torch.from_numpy(clip.time_s)).double().numpy()
+            # float32 rotations are re-projected, so that the track stays rigid to the last digit.
+            u, _, vt = np.linalg.svd(poses[:, :3, :3])
+            poses[:, :3, :3] = u @ vt
+            moved = "refined" if float(model.root_free[i]) > 0 else "given"
+            track = formats.PoseTrack(
+                model.intrinsics(i).double().numpy(), poses, collection.confidence[i], [moved] * len(clip)
+            )
+            formats.write_poses(out / "poses" / f"{name}.json", track, clip)
+    lines = "".join(json.dumps(row) + "\n" for row in history)
+    (out / "metrics.jsonl").write_text(lines, encoding="utf-8")
+    (out / "previews").mkdir()
+    _write_preview(model, collection, out / "previews" / "overlay.png")
+
+
+def _write_preview(model: Banmo, collection: Collection, path: Path) -> None:
+    images = []
+    for i, clip in enumerate(collection.clips.values()):
+        for frame in (len(clip) // 5, (4 * len(clip)) // 5):
+            images.append((i, frame, clip.image(frame)))
+    formats.write_image(path, preview_sheet(model, images[:12]))
+
+
+def _check(out: Path, frames: dict[str, Folder]) -> None:
+    tensors, description = formats.read_model(out)
+    broken = [name for name, value in tensors.items() if value.is_floating_point() and not torch.isfinite(value).all()]
+    if broken:
+        raise formats.FormatError(f"model.safetensors: {broken[0]} is not finite")
+    if [v["name"] for v in description["videos"]] != list(frames):
+        raise formats.FormatError("model.json: the videos are not those of the collection")
+    for name in frames:
+        formats.read_poses(out / "poses" / f"{name}.json")
+
+
+def _sheet(out: Path, picture: Path) -> None:
+    picture.write_bytes((out / "previews" / "overlay.png").read_bytes())
+
+
+for _phase in (fit, correct, refine):
+    _phase.check(_check)
+    _phase.sheet(_sheet)
