@@ -220,19 +220,16 @@ def _bake(
     points = texels.spread(rig.mesh.faces, rig.mesh.vertices)
     baker = atlas.Baker(rig.mesh, texels, field_colour(model, points, len(inputs)))
     per_video = max(1, _BAKED_FRAMES // len(inputs))
-    chosen = [
-        (video, posed, int(i))
-        for video, posed in zip(inputs, clips, strict=True)
-        for i in np.unique(np.linspace(0, len(video.clip) - 1, per_video).round())
-        if "missing" not in video.facts.flags[int(i)]
-    ]
-    for video, posed, i in run.progress(chosen, label="texture"):
-        pose = posed.camera_from_object[video.clip.source_idx[i]]
-        points = posed.vertices[video.clip.source_idx[i]] @ pose[:3, :3].T + pose[:3, 3]
-        width, height = video.clip.width, video.clip.height
-        fragments = rasterise(points, rig.mesh.faces, posed.intrinsics, height, width)
-        mask = video.mask(i, width, height)
-        baker.add(points, posed.intrinsics, fragments, video.clip.image(i), mask, 0.01 * rig.mesh.length)
+    for video, posed in zip(inputs, clips, strict=True):
+        chosen = np.unique(np.linspace(0, len(video.clip) - 1, per_video).round().astype(int))
+        for i in run.progress([c for c in chosen.tolist() if "missing" not in video.facts.flags[c]], label="texture"):
+            pose = posed.camera_from_object[video.clip.source_idx[i]]
+            points = posed.vertices[video.clip.source_idx[i]] @ pose[:3, :3].T + pose[:3, 3]
+            width, height = video.clip.width, video.clip.height
+            fragments = rasterise(points, rig.mesh.faces, posed.intrinsics, height, width)
+            mask = video.mask(i, width, height)
+            baker.add(points, posed.intrinsics, fragments, video.clip.image(i), mask, 0.01 * rig.mesh.length)
+        baker.end_clip()
     picture, from_frames = baker.picture()
     return Texture(charts, picture, from_frames)
 

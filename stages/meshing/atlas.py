@@ -72,7 +72,7 @@ def texels_of(atlas: Atlas, size_px: int) -> Texels:
 
 
 class Baker:
-    """Gathers colour for texels, frame by frame.
+    """Gathers colour for texels, frame by frame and clip by clip.
 
     Samples are weighted by the angle of view and by how many pixels the frame spends on the face, raised so that the
     best views dominate; near the outline of the object nothing is taken.
@@ -81,8 +81,8 @@ class Baker:
     def __init__(self, mesh: Mesh, texels: Texels, field_colour: np.ndarray) -> None:
         self._mesh, self._texels = mesh, texels
         self._field = field_colour.astype(np.float32)  # (P, 3) the model's own, in 0..1
-        self._total = np.zeros_like(self._field)
-        self._weight = np.zeros(len(texels.pixel), np.float32)
+        self._total, self._clip_total = np.zeros_like(self._field), np.zeros_like(self._field)
+        self._weight, self._clip_weight = np.zeros((2, len(texels.pixel)), np.float32)
 
     def add(
         self,
@@ -117,12 +117,21 @@ class Baker:
             return
         colour = _bilinear(frame, position - 0.5)
         weight = face_weight[self._texels.face[candidate]].astype(np.float32)
-        # Exposure and light differ from clip to clip: bring this frame's mean to the model's, channel by channel.
-        gain = (self._field[candidate] * weight[:, None]).sum(axis=0) / ((colour * weight[:, None]).sum(axis=0) + 1e-6)
-        colour = np.clip(colour * np.clip(gain, 0.5, 2.0), 0, 1)
         weight[np.abs(colour - self._field[candidate]).max(axis=1) > _OUTLIER] = 0
-        self._total[candidate] += colour * weight[:, None]
-        self._weight[candidate] += weight
+        self._clip_total[candidate] += colour * weight[:, None]
+        self._clip_weight[candidate] += weight
+
+    def end_clip(self) -> None:
+        """Merge what was added since the last call: frames of one video, in one light.
+
+        Exposure and light differ from clip to clip, so the clip's mean colour is brought to the model's own, channel
+        by channel, over what the clip shows.
+        """
+        expected = (self._field * self._clip_weight[:, None]).sum(axis=0, dtype=np.float64)
+        gain = np.clip(expected / (self._clip_total.sum(axis=0, dtype=np.float64) + 1e-6), 0.5, 2.0)
+        self._total += np.minimum(self._clip_total * gain.astype(np.float32), self._clip_weight[:, None])
+        self._weight += self._clip_weight
+        self._clip_total[:], self._clip_weight[:] = 0, 0
 
     def picture(self) -> tuple[np.ndarray, float]:
         """The texture (S, S, 3) uint8 sRGB, charts grown into the gaps, and the share of texels from frames."""
