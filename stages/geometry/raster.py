@@ -112,7 +112,10 @@ def rasterise(
     e1, e2 = edge_1[selected] * inverse_area[:, None], edge_2[selected] * inverse_area[:, None]
     slope = np.stack([e2[:, 1], -e2[:, 0], -e1[:, 1], e1[:, 0]], axis=1)
     start = np.stack(
-        [origin[:, 0] * slope[:, 0] + origin[:, 1] * slope[:, 1], origin[:, 0] * slope[:, 2] + origin[:, 1] * slope[:, 3]],
+        [
+            origin[:, 0] * slope[:, 0] + origin[:, 1] * slope[:, 1],
+            origin[:, 0] * slope[:, 2] + origin[:, 1] * slope[:, 3],
+        ],
         axis=1,
     ).astype(np.float32)
     slope = slope.astype(np.float32)
@@ -170,7 +173,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, mean of the adjoining faces weighted by area; (0, 1, 0) where there is none."""
     normal = face_normals(vertices.astype(np.float64), faces)
     total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)], axis=1
+        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
+        axis=1,
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 1e-12, total / np.maximum(length, 1e-12), (0.0, 1.0, 0.0))
