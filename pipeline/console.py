@@ -9,6 +9,8 @@ from typing import Any, TextIO
 from pipeline.plan import HIT, WAIT, Step
 from pipeline.reasons import brief
 
+_MOST_LINES = 40
+
 
 def duration(seconds: float) -> str:
     """``4.2 s``, ``1:05 min``, ``2 h 41 min``."""
@@ -29,9 +31,12 @@ def size(count: float) -> str:
 
 
 def print_plan(steps: list[Step], stream: TextIO | None = None) -> None:
-    """One line a node that is not up to date."""
+    """One line a node that is not up to date; one line a stage when they are many."""
     stream = stream or sys.stdout
     pending = [s for s in steps if s.status != HIT]
+    if len(pending) > _MOST_LINES:
+        _print_stages(pending, stream)
+        return
     width = max((len(s.node.label) for s in pending), default=0)
     for step in pending:
         past = f"  took {duration(step.record.seconds)} last time" if step.record else ""
@@ -40,6 +45,16 @@ def print_plan(steps: list[Step], stream: TextIO | None = None) -> None:
         else:
             what = brief(step.reasons)
         stream.write(f"  {step.node.label:<{width}}  {what}{past}\n")
+
+
+def _print_stages(pending: list[Step], stream: TextIO) -> None:
+    counts: dict[tuple[str, str], int] = {}
+    for step in pending:
+        what = "waits" if step.status == WAIT else brief(step.reasons)
+        counts[(step.node.info.name, what)] = counts.get((step.node.info.name, what), 0) + 1
+    width = max(len(stage) for stage, _ in counts)
+    for (stage, what), count in counts.items():
+        stream.write(f"  {stage:<{width}}  {count:>6}  {what}\n")
 
 
 class PlainDisplay:
@@ -68,8 +83,8 @@ class PlainDisplay:
             self._line(f"{label}: failed, its input is at fault")
         elif kind == "interrupted":
             self._line(f"{label}: {text}; the next run goes on from its checkpoint")
-        elif kind == "waiting":
-            self._line(f"{label}: {text}; waiting")
+        elif kind in ("waiting", "silent"):
+            self._line(f"{label}: {text}")
         elif kind == "stopping":
             self._line("stopping: workers save their work; once more to kill them")
 

@@ -64,6 +64,7 @@ class LiveDisplay:
         self._states = {s.node.label: self._first_word(s) for s in steps}
         self._expected_s, self._cpus = expected_s, cpus
         self._running: dict[str, Progress] = {}
+        self._took_s: dict[str, list[float]] = {}
         self._started = time.monotonic()
         self._drawn = 0.0
         self._note = ""
@@ -91,10 +92,12 @@ class LiveDisplay:
             progress.event = event
             if progress.first is None or event.get("done", 0) < progress.first[1]:
                 progress.first = (time.monotonic(), float(event.get("done", 0)))
-        elif kind == "waiting" and label in self._running:
+        elif kind in ("waiting", "silent") and label in self._running:
             self._running[label].event = {"label": event.get("text", ""), "done": 0}
         elif kind in ("done", "failed", "bad_input", "interrupted"):
             self._running.pop(label, None)
+        if kind == "done":
+            self._took_s.setdefault(label.partition("/")[0], []).append(float(event.get("seconds", 0.0)))
         if kind in ("failed", "bad_input"):
             self._live.console.print(Text(f"{label} failed: {event.get('text', '')}", style="red"))
 
@@ -130,7 +133,8 @@ class LiveDisplay:
             state = self._states[node.label]
             if state not in ("running", "to run", "waits"):
                 continue
-            known = self._expected_s.get(node.label)
+            took = self._took_s.get(node.info.name)
+            known = self._expected_s.get(node.label, sum(took) / len(took) if took else None)
             progress = self._running.get(node.label)
             left = progress.seconds_left() if progress else known
             if left is None and progress is not None and known is not None:

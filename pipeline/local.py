@@ -86,6 +86,8 @@ class Job:
         self.attempt, self.cpus, self.gpus, self.log_path = attempt, cpus, gpus, log_path
         self.events = EventReader(attempt / "events.jsonl")
         self.started = time.monotonic()
+        self.last_sign = self.started
+        self.told_silent = False
         self._stop_by: float | None = None
         self._killed = False
         environment = child_environment(Path(request["package_dir"]))

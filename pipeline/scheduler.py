@@ -20,6 +20,7 @@ from pipeline.request import build_request
 from pipeline.runs import RunFolder
 
 _POLL_S = 0.05
+_SILENT_S = 600.0
 
 
 class Display(Protocol):
@@ -188,13 +189,22 @@ class Scheduler:
         for node, job in list(self._jobs.items()):
             outcome = job.poll()
             for event in job.events.read():
+                job.last_sign = time.monotonic()
                 self._tell(node, {k: v for k, v in event.items() if k != "label"})
             if outcome is None:
+                self._mind_silence(node, job)
                 continue
             del self._jobs[node]
             self.tokens.give_back(job.cpus, job.gpus)
             self._finish(node, job, outcome)
             remove_tree(job.attempt)
+
+    def _mind_silence(self, node: Node, job: Job) -> None:
+        """Say so, once, when a worker has given no sign of life for long; only the user knows whether it hangs."""
+        if not job.told_silent and time.monotonic() - job.last_sign > _SILENT_S:
+            job.told_silent = True
+            text = f"no progress for {_SILENT_S / 60:.0f} min; `banmo log {node.label.replace('/', ' ')}` may tell why"
+            self._tell(node, {"event": "silent", "text": text})
 
     def _finish(self, node: Node, job: Job, outcome: Outcome) -> None:
         seconds = round(time.monotonic() - job.started, 2)

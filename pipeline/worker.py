@@ -123,7 +123,7 @@ class Worker:
                 break
             except Timeout:
                 if not told:
-                    self.events({"event": "waiting", "text": "another run is making this"})
+                    self.events({"event": "waiting", "text": "another run is making this; waiting for it"})
                     told = True
                 if self.context.stop_requested:
                     raise Interrupted("stopped while waiting for another run") from None

@@ -166,4 +166,4 @@ class Workspace:
 def template_dir() -> Path | None:
     """The folder that ``init`` copies, if it is installed beside the engine."""
     path = Path(__file__).resolve().parent.parent / "workspace_template"
-    return path if (path / "pipeline.toml").is_file() else None
+    return path if (path / "README.md").is_file() else None
