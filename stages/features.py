@@ -46,7 +46,7 @@ class FeatureSettings:
 
 @stage(per=Video, version=1, given=(".features.npy",), needs=Resources(cpus=1))
 def features(frames: Folder, masks: Folder, given: Given, settings: FeatureSettings, out: Path, run: Run) -> None:
-    """`features.npy` float16 (T, 112, 112, 16), unit length on the object and zero off it; `features.json` with crops."""
+    """Embeddings (T, 112, 112, 16) float16, unit length on the object and zero off it, and the crop of each frame."""
     cv2.setNumThreads(1)
     clip = read_clip(frames.path)
     boxes = read_mask_facts(masks.path).box
@@ -95,7 +95,7 @@ def _crop_mask(masks: Folder, clip: Clip, frame_idx: int, crop: np.ndarray) -> n
 
 
 def _given(path: Path, clip: Clip, crops: np.ndarray) -> np.ndarray:
-    """Features from the user's array: (N or T, H, W, 16) over the whole picture, or (N or T, 112, 112, 16) on our crops."""
+    """The user's array: (N or T, H, W, 16) over the whole picture, or (N or T, 112, 112, 16) on our crops."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:

@@ -1,18 +1,20 @@
 """masks: how probably each pixel of each kept frame is the object.
 
-Who answers, first to last: what lies beside the video (`clip.masks/` with PNGs, `clip.masks.mp4`), the ONNX network that
-the settings name, the built-in segmentation by motion, place and colour (steered by `clip.hints.toml`).
+Who answers, first to last: what lies beside the video (`clip.masks/` with PNGs, `clip.masks.mp4`), the ONNX network
+that the settings name, the built-in segmentation by motion, place and colour (steered by `clip.hints.toml`).
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
 from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Video, stage
 from stages.decoding import list_images, natural_key, read_frames
@@ -31,7 +33,7 @@ from stages.formats import (
 from stages.networks import MaskNetwork
 from stages.perception.background import shrink
 from stages.perception.optical_flow import new_matcher, sample
-from stages.perception.segmentation import Hint, Segmentation, segment
+from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
 from stages.perception.temporal import describe
 
@@ -45,6 +47,10 @@ class MaskSettings:
 
     threshold: float = 0.5
     """Probability above which a pixel counts as the object, for boxes, areas and flags."""
+    self_training_steps: int = 300
+    """Steps in which the built-in segmentation fits its small network to the clip; 0 leaves that network out."""
+    seed: int = 0
+    """Seed of the built-in segmentation."""
     network: InputFile = InputFile("")
     """An ONNX file that turns a 1x3xHxW picture into a 1x1xHxW mask (u2net, isnet, birefnet ...); empty for none."""
     network_contract: InputFile = InputFile("")
@@ -54,6 +60,8 @@ class MaskSettings:
 @stage(per=Video, version=1, given=(".masks", ".masks.mp4", ".hints.toml"), needs=Resources(cpus=1))
 def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: Run) -> None:
     """Foreground probability of every frame, one 8-bit PNG each; `masks.json` says who answered and how sure it is."""
+    cv2.setNumThreads(1)  # DIS gives other digits with other thread counts, and so does torch
+    torch.set_num_threads(1)
     clip = read_clip(frames.path)
     folder, video = given.get(".masks"), given.get(".masks.mp4")
     if folder is not None:
@@ -65,12 +73,22 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        result = segment(clip.images(), hints, tick=lambda done, total, label: run.tick(done, total, label=label))
+        effort = Effort(network_steps=settings.self_training_steps, seed=settings.seed)
+        result = segment(clip.images(), hints, effort, tick=_ticker(run))
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
     facts = _facts(provider, result, clip, settings.threshold)
     write_mask_facts(out, facts, clip)
     _report(facts, settings, run, clip)
+
+
+def _ticker(run: Run) -> Callable[[int, int, str], None]:
+    def tick(done: int, total: int, label: str) -> None:
+        run.tick(done, total, label=label)
+        if run.stop_requested:
+            run.interrupt()
+
+    return tick
 
 
 def _certain(probability: np.ndarray) -> Segmentation:
@@ -92,8 +110,8 @@ def _from_folder(folder: Path, clip: Clip) -> np.ndarray:
 def pick_files(stems: list[str], clip: Clip, what: str) -> list[int]:
     """Which of the given files belongs to each kept frame.
 
-    One file a source frame in natural order, or files whose last number is the source index of a kept frame, or one file
-    a kept frame; anything else is refused.
+    One file a source frame in natural order, or files whose last number is the source index of a kept frame, or one
+    file a kept frame; anything else is refused.
     """
     source, kept = len(clip.source_time_s), len(clip)
     if len(stems) == source:
@@ -138,9 +156,8 @@ def _fit(mask: np.ndarray, clip: Clip, what: str) -> np.ndarray:
     if (width, height) == (clip.width, clip.height):
         return mask
     if abs(width / height / (clip.width / clip.height) - 1) > ASPECT_TOLERANCE:
-        raise BadInput(
-            f"{what} is {width}x{height}, which has another shape than the frames ({clip.width}x{clip.height})"
-        )
+        frame = f"{clip.width}x{clip.height}"
+        raise BadInput(f"{what} is {width}x{height}, which has another shape than the frames ({frame})")
     shrinking = width > clip.width
     return cv2.resize(mask, (clip.width, clip.height), interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)
 
@@ -162,7 +179,7 @@ def _from_network(clip: Clip, settings: MaskSettings, run: Run) -> Segmentation:
 
 
 def read_hints(path: Path | None, clip: Clip) -> tuple[Hint, ...]:
-    """`clip.hints.toml`: tables `[[hint]]` with `frame` (source index) or `time_s`, and any of `box`, `inside`, `outside`.
+    """`clip.hints.toml`: tables `[[hint]]` with `frame` (source index) or `time_s`, and `box`, `inside` or `outside`.
 
     Coordinates are pixels of the upright source video. Raises `BadInput` on anything else.
     """

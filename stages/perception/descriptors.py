@@ -32,7 +32,8 @@ def crop_box(box: np.ndarray, width: int, height: int, margin: float = CROP_MARG
 def crop_resize(image: np.ndarray, crop: np.ndarray, side: int = FEATURE_SIZE) -> np.ndarray:
     """An image (H, W) or (H, W, C) on the crop's grid of `side` x `side` cells; zero outside the image.
 
-    Cell (r, c) is centred on pixel x0 + (c + 0.5) (x1 - x0) / side; averaged over its area when it is larger than a pixel.
+    Cell (r, c) is centred on pixel x0 + (c + 0.5) (x1 - x0) / side; averaged over its area when that is larger than a
+    pixel.
     """
     step = (crop[2] - crop[0]) / side
     whole = max(1, int(round(step)))  # so many samples a cell and axis, then averaged
@@ -46,8 +47,8 @@ def crop_resize(image: np.ndarray, crop: np.ndarray, side: int = FEATURE_SIZE) -
 def describe_appearance(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(S, S, 16) float32 descriptor of a crop (S, S, 3) uint8 RGB under a mask (S, S) in 0..1; zero off the mask.
 
-    Channels before normalisation: L, a, b blurred within the mask at three scales (9), local contrast at two (2), band-pass
-    energy at two (2), depth inside the outline (1), height in the mask (1), a constant (1).
+    Channels before normalisation: L, a, b blurred within the mask at three scales (9), local contrast at two (2),
+    band-pass energy at two (2), depth inside the outline (1), height in the mask (1), a constant (1).
     """
     inside = mask > 0.5
     out = np.zeros((*mask.shape, FEATURE_CHANNELS), np.float32)
@@ -95,8 +96,8 @@ def _blur_inside(values: np.ndarray, weight: np.ndarray, sigma: float) -> np.nda
 def match_trust(features: np.ndarray, rng: np.random.Generator, pairs: int = 24, samples: int = 64) -> float:
     """How distinctly points of one frame find a place in another, 0..1: mean of 1 - d1/d2 over sampled points.
 
-    d1 is the descriptor distance to the best cell, d2 to the best at least a fifth of the crop away from it. A plain-coloured
-    object, on which everything looks alike, comes near 0. `features` is (T, S, S, C).
+    d1 is the descriptor distance to the best cell, d2 to the best at least a fifth of the crop away from it. A
+    plain-coloured object, on which everything looks alike, comes near 0. `features` is (T, S, S, C).
     """
     count, side = features.shape[:2]
     found = []

@@ -1,6 +1,7 @@
 """Dense optical flow between the frames of a clip: DIS, forward-backward confidence, chaining.
 
-A flow (H, W, 2) float32 is in pixels, x to the right and y down: ``frame_j[p + flow[p]]`` shows what ``frame_i[p]`` does.
+A flow (H, W, 2) float32 is in pixels, x to the right and y down: ``frame_j[p + flow[p]]`` shows what
+``frame_i[p]`` does.
 """
 
 from __future__ import annotations
@@ -103,8 +104,8 @@ def direct_pairs(
 def chained_pairs(grey: np.ndarray, steps: Sequence[int], matcher: cv2.DISOpticalFlow) -> Iterator[FlowPair]:
     """All pairs of (T, H, W) uint8 frames at the given steps by DIS, long steps started from chained short ones.
 
-    A step that is a sum of two earlier equal ones (2 = 1 + 1, 4 = 2 + 2 ...) is matched twice, from nothing and from the
-    chain; each pixel takes the one whose round trip closes better.
+    A step that is a sum of two earlier equal ones (2 = 1 + 1, 4 = 2 + 2 ...) is matched twice, from nothing and from
+    the chain; each pixel takes the one whose round trip closes better.
     """
     grid = pixel_grid(*grey.shape[1:3])
     kept: dict[int, dict[int, FlowPair]] = {}

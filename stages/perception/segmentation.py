@@ -1,4 +1,12 @@
-"""Which pixels are the object, from motion, place and colour, with no network."""
+"""Which pixels are the object, with no network and no download: motion, place and looks, over the whole clip.
+
+1. Motion against the background gives each frame sharp but sparse evidence (`background.motion_cues`).
+2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
+   where the object is, is carried between frames by flow.
+3. The same again on plain colours, leaving the uncertain rim of the mask out of the fit: this tightens the outline.
+4. A small network is fitted to the result on crops around the object; it sees surroundings and cleans up.
+5. The outline is settled at full resolution, and flicker is voted away along the flow.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +16,14 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from stages.perception.background import border_distance, motion_saliency, shrink
-from stages.perception.temporal import main_component
+from stages.perception.appearance import ClipNetwork, PixelColours, scaled_lab
+from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
+from stages.perception.optical_flow import new_matcher, sample
+from stages.perception.temporal import flow_median, main_component
 
-CUE_SIDE_PX = 128
+WORK_SIDE_PX = 256
+CARRY_SIDE_PX = 128
+Tick = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -32,70 +44,227 @@ class Segmentation:
     agreement: np.ndarray
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much work the built-in segmentation does."""
+
+    rounds: int = 2
+    network_steps: int = 300
+    seed: int = 0
+
+
+class Carrier:
+    """Moves maps between neighbouring frames along the flow, at a small size."""
+
+    def __init__(self, work: list[np.ndarray]) -> None:
+        grey = [cv2.cvtColor(shrink(image, CARRY_SIDE_PX), cv2.COLOR_RGB2GRAY) for image in work]
+        matcher = new_matcher("fast")
+        self.size = grey[0].shape[::-1]
+        pairs = list(zip(grey[:-1], grey[1:], strict=True))
+        self.to_next = [matcher.calc(a, b, None) for a, b in pairs]  # frame t -> t+1
+        self.to_previous = [matcher.calc(b, a, None) for a, b in pairs]  # frame t+1 -> t
+
+    def spread(self, maps: np.ndarray, decay: float, strongest: bool = True) -> np.ndarray:
+        """(T, h, w) maps, each joined with its neighbours' carried here, weaker by `decay` a frame.
+
+        `strongest` joins by the larger value, otherwise by the value larger in size (for signed maps).
+        """
+        small = [cv2.resize(m.astype(np.float32), self.size, interpolation=cv2.INTER_AREA) for m in maps]
+        join = np.maximum if strongest else (lambda a, b: np.where(np.abs(a) >= np.abs(b), a, b))
+        forth, back = list(small), list(small)
+        for t in range(1, len(small)):
+            forth[t] = join(small[t], decay * sample(forth[t - 1], self.to_previous[t - 1]))
+        for t in range(len(small) - 2, -1, -1):
+            back[t] = join(small[t], decay * sample(back[t + 1], self.to_next[t]))
+        size = maps.shape[2], maps.shape[1]
+        return np.stack(
+            [cv2.resize(join(a, b), size, interpolation=cv2.INTER_LINEAR) for a, b in zip(forth, back, strict=True)]
+        )
+
+
 def segment(
     images: np.ndarray,
     hints: tuple[Hint, ...] = (),
-    tick: Callable[[int, int, str], None] = lambda done, total, label: None,
+    effort: Effort | None = None,
+    tick: Tick = lambda done, total, label: None,
 ) -> Segmentation:
     """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB."""
+    effort = effort or Effort()
+    work = [shrink(image, WORK_SIDE_PX) for image in images]
+    cues = motion_cues(work, tick=lambda done: tick(done, len(work), "motion"))
+    carrier = Carrier(work)
+    told = hint_evidence(hints, images.shape[1:3], work[0].shape[:2], len(work))
+    if hints:
+        told = carrier.spread(told, 0.93, strongest=False)
+    soft = coarse_probability(work, cues, told, carrier, effort)
+    tick(1, 3, "learning")
+    soft = tight_probability(work, soft, cues, told, effort)
+    tick(2, 3, "learning")
+    soft = network_probability(work, soft, told, effort)
+    tick(3, 3, "learning")
+    return finish(images, soft, carrier)
+
+
+# --------------------------------------------------------------------------------------------- the steps
+
+
+def coarse_probability(
+    work: list[np.ndarray], cues: MotionCues, told: np.ndarray, carrier: Carrier, effort: Effort
+) -> np.ndarray:
+    """(T, h, w) probability from motion evidence and colours in their surroundings; finds the object, a little fat."""
+    count = len(work)
+    centre = np.exp(-0.5 * (border_distance(*work[0].shape[:2]) / 0.75) ** 6)
+    seed = np.clip(cues.evidence / 1.5, 0, 1) * centre * np.clip(cues.moving / 0.3, 0, 1)
+    seed = np.where(told > 0.5, np.maximum(seed, np.clip(told / 3, 0, 1)), np.where(told < -0.5, 0, seed))
+    near = carrier.spread(_nearness(seed, 6.0), 0.95)
+    away = np.clip(1 - 4 * near, 0, 1) * (cues.evidence < 0.5) * np.clip(1.3 - 2 * cues.moving, 0.2, 1)
+    away = np.where(told < -0.5, 1.0, away)
+    label = (seed > away).astype(np.float32)
+    weight = np.where(seed > 0.2, seed, np.where(away > 0.2, 0.7 * away, 0)).astype(np.float32)
+    values = np.stack([_coloured_surroundings(image) for image in work])
+    soft = seed.astype(np.float32)
+    for turn in range(effort.rounds):
+        colours = PixelColours(values.shape[-1], effort.seed + turn)
+        if not colours.fit(values, label, weight):
+            break
+        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 1.0) for x in colours.logit(values)])
+        place = 1.5 * np.log(np.clip(3 * near, 0.03, 1))
+        logit = looks - 0.7 + 0.8 * np.clip(cues.evidence, -1, 3) + place + told
+        soft = _sigmoid(logit)
+        near = carrier.spread(_nearness(np.where(soft > 0.5, soft, 0), 8.0), 0.95)
+        label = (soft > 0.5).astype(np.float32)
+        sure = np.abs(soft - 0.5) * 2
+        weight = np.where(sure > 0.4, sure, 0).astype(np.float32)
+    return np.stack([main_component(soft[t] > 0.5, soft[t]) * soft[t] for t in range(count)])
+
+
+def tight_probability(
+    work: list[np.ndarray], soft: np.ndarray, cues: MotionCues, told: np.ndarray, effort: Effort, rim_px: int = 3
+) -> np.ndarray:
+    """(T, h, w) probability from plain colours, fitted without the rim of the mask, where the labels are least sure."""
+    values = np.stack([scaled_lab(image) for image in work])
+    found = soft
+    for turn in range(2):
+        core, off, close = _rim(found > 0.5, max(1, rim_px - turn))
+        weight = core + off * np.where(close, 1.0, 0.15)
+        colours = PixelColours(values.shape[-1], effort.seed + 10 + turn)
+        if not colours.fit(values, core, weight, steps=500):
+            return found
+        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.8) for x in colours.logit(values)])
+        logit = looks - 1.0 + 0.5 * np.clip(cues.evidence, -1, 3) + told
+        found = np.where(off, 0.002, _sigmoid(logit)).astype(np.float32)
+        found = np.stack([main_component(f > 0.5, f) * f for f in found])
+    return found
+
+
+def network_probability(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, effort: Effort) -> np.ndarray:
+    """(T, h, w) probability from a small network fitted to crops around the object, labels near the outline soft."""
+    if effort.network_steps <= 0 or not (soft > 0.5).any():
+        return soft
+    crops = [_crop_window(p > 0.5, work[0].shape[:2]) for p in soft]
+    size = max(c[2] for c in crops), max(c[3] for c in crops)
+    windows = [_place_window(c, size, work[0].shape[:2]) for c in crops]
+    lab = np.stack([scaled_lab(work[t])[w] for t, w in enumerate(windows)])
+    target = np.stack([soft[t][w] for t, w in enumerate(windows)])
+    weight = np.clip(np.abs(target - 0.5) * 2, 0.05, 1)
+    network = ClipNetwork(effort.seed + 20)
+    network.fit(lab, target, weight, effort.network_steps)
+    logit = network.logit(lab)
+    out = np.zeros_like(soft)
+    for t, w in enumerate(windows):
+        out[t][w] = _sigmoid(logit[t] + 0.3 * np.log((target[t] + 0.02) / (1.02 - target[t])) + told[t][w])
+    return out
+
+
+def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentation:
+    """Masks at full size: flicker voted away along the flow, outline settled on edges, stray pieces dropped."""
     count, height, width = images.shape[:3]
-    small = [shrink(image, CUE_SIDE_PX) for image in images]
-    grey = [cv2.cvtColor(s, cv2.COLOR_RGB2GRAY) for s in small]
-    distance = border_distance(*grey[0].shape)
-    trust = np.where(distance > 0.55, 1.0, 0.25).astype(np.float32)
-    motion = motion_saliency(grey, lambda t: trust, tick=lambda done: tick(done, count, "motion"))
-    soft = _appearance(small, motion, distance)
+    steady = flow_median(soft, carrier.to_next, carrier.to_previous)
     out = np.zeros((count, height, width), np.uint8)
     agreement = np.zeros(count)
     for t in range(count):
-        prior = cv2.resize(soft[t], (width, height), interpolation=cv2.INTER_LINEAR)
-        cut = main_component(grab_cut(images[t], prior), prior)
-        agreement[t] = np.count_nonzero(cut & (prior > 0.5)) / max(np.count_nonzero(cut | (prior > 0.5)), 1)
-        out[t] = np.round(255 * np.where(cut, np.maximum(prior, 0.55), np.minimum(prior, 0.45))).astype(np.uint8)
-        tick(t + 1, count, "cutting")
+        prior = cv2.resize(steady[t], (width, height), interpolation=cv2.INTER_LINEAR)
+        cut = main_component(prior > 0.5, prior)
+        union = np.count_nonzero(cut | (prior > 0.25))
+        agreement[t] = np.count_nonzero(cut & (prior > 0.75)) / max(union, 1)
+        held = np.where(cut, np.maximum(prior, 0.51), np.minimum(prior, 0.49))
+        out[t] = np.round(255 * held).astype(np.uint8)
     return Segmentation(out, agreement)
 
 
-def grab_cut(image: np.ndarray, prior: np.ndarray, iterations: int = 2) -> np.ndarray:
-    """Boolean (H, W) cut of an RGB image along its edges, started from a foreground probability (H, W)."""
-    marks = np.where(prior > 0.5, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    marks[prior > 0.97], marks[prior < 0.05] = cv2.GC_FGD, cv2.GC_BGD
-    foreground = (marks == cv2.GC_FGD) | (marks == cv2.GC_PR_FGD)
-    if not 20 <= np.count_nonzero(foreground) <= foreground.size - 20:
-        return foreground
-    bgr = np.ascontiguousarray(image[:, :, ::-1])
-    cv2.grabCut(bgr, marks, None, np.zeros((1, 65)), np.zeros((1, 65)), iterations, cv2.GC_INIT_WITH_MASK)
-    return (marks == cv2.GC_FGD) | (marks == cv2.GC_PR_FGD)
+# --------------------------------------------------------------------------------------------- pieces
 
 
-def _appearance(small: list[np.ndarray], motion: np.ndarray, distance: np.ndarray, rounds: int = 4) -> np.ndarray:
-    """(T, h, w) probability from colour histograms of the whole clip, learnt from the moving middle, in rounds."""
-    count = len(small)
-    lab = np.stack([cv2.cvtColor(s, cv2.COLOR_RGB2LAB) for s in small])
-    cell = (lab[..., 0] // 16).astype(np.int64) * 1024 + (lab[..., 1] // 8) * 32 + lab[..., 2] // 8
-    soft = motion * np.exp(-0.5 * (distance / 0.6) ** 4)
-    top = np.quantile(soft.reshape(count, -1), 0.97, axis=1)[:, None, None]
-    soft = np.clip(soft / np.maximum(top, 0.15), 0, 1).astype(np.float32)
-    for _ in range(rounds):
-        ratio = np.log(
-            _histogram(cell, np.where(soft > 0.6, soft, 0)) / _histogram(cell, np.where(soft < 0.35, 1 - soft, 0))
-        )
-        votes = np.clip(ratio[cell], -4, 4).astype(np.float32)
-        logit = np.stack(
-            [
-                0.9 * cv2.GaussianBlur(votes[t], (0, 0), 1.0)
-                + 4.0 * (cv2.GaussianBlur(soft[t], (0, 0), 5.0) - 0.35)
-                + 3.0 * (motion[t] - 0.35)
-                for t in range(count)
-            ]
-        )
-        soft = 1.0 / (1.0 + np.exp(-logit))
-    return soft
+def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[int, ...], count: int) -> np.ndarray:
+    """(T, h, w) log-odds from the user's hints at their own frames, zero elsewhere."""
+    out = np.zeros((count, *work), np.float32)
+    scale = np.array([work[1] / full[1], work[0] / full[0]])
+    rows, columns = np.mgrid[0 : work[0], 0 : work[1]] + 0.5
+    for hint in hints:
+        layer = out[hint.frame_idx]
+        if hint.box is not None:
+            x0, y0, x1, y1 = hint.box * np.tile(scale, 2)
+            inside = (columns >= x0 - 1) & (columns <= x1 + 1) & (rows >= y0 - 1) & (rows <= y1 + 1)
+            u, v = (2 * columns - x0 - x1) / (x1 - x0), (2 * rows - y0 - y1) / (y1 - y0)
+            middle = np.clip(1.0 - np.hypot(u, v), 0, 1)
+            layer[:] = np.where(inside, 0.2 + 2.5 * middle, -5.0)
+        reach = 0.02 * max(work) + 1.5
+        for points, value in ((hint.inside, 6.0), (hint.outside, -6.0)):
+            for x, y in points * scale:
+                layer[np.hypot(columns - x, rows - y) <= reach] = value
+    return out
 
 
-def _histogram(cell: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Normalised, smoothed weights of 16 x 32 x 32 Lab cells, never zero."""
-    counts = np.bincount(cell.ravel(), weights=weight.ravel(), minlength=16 * 32 * 32).reshape(16, 32, 32)
-    for axis in range(3):
-        counts = counts + 0.4 * (np.roll(counts, 1, axis) + np.roll(counts, -1, axis))
-    return (counts / max(counts.sum(), 1e-9) + 1e-6).ravel()
+def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Blurred maps, each scaled so that its top per cent is at 1."""
+    blurred = np.stack([cv2.GaussianBlur(m.astype(np.float32), (0, 0), sigma_px) for m in maps])
+    top = np.quantile(blurred.reshape(len(maps), -1), 0.99, axis=1)
+    return blurred / np.maximum(top, 0.1)[:, None, None]
+
+
+def _coloured_surroundings(image: np.ndarray) -> np.ndarray:
+    """(h, w, 12) float32: Lab as it is, blurred twice, and its local spread."""
+    lab = scaled_lab(image)
+    spread = cv2.GaussianBlur(lab**2, (0, 0), 2.0) - cv2.GaussianBlur(lab, (0, 0), 2.0) ** 2
+    blurred = [cv2.GaussianBlur(lab, (0, 0), s) for s in (1.5, 3.0)]
+    return np.concatenate([lab, *blurred, 3 * np.sqrt(np.maximum(spread, 0))], axis=-1)
+
+
+def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Core (eroded by the rim), outside (beyond the rim) and close surroundings of boolean (T, h, w) masks."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim_px + 1, 2 * rim_px + 1))
+    wide = np.ones((41, 41), np.uint8)
+    eight = masks.astype(np.uint8)
+    core = np.stack([cv2.erode(m, disc) for m in eight])
+    off = np.stack([cv2.dilate(m, disc) for m in eight]) == 0
+    close = np.stack([cv2.dilate(m, wide) for m in eight]) > 0
+    return core.astype(np.float32), off, close
+
+
+def _crop_window(mask: np.ndarray, shape: tuple[int, ...], margin: float = 0.2) -> tuple[int, int, int, int]:
+    """Centre column and row, width and height of a window round a mask, in multiples of 8."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        return shape[1] // 2, shape[0] // 2, 8, 8
+    width, height = columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1
+    pad = margin * max(width, height) + 4
+    return (
+        int(columns[0] + columns[-1] + 1) // 2,
+        int(rows[0] + rows[-1] + 1) // 2,
+        int(np.ceil((width + 2 * pad) / 8) * 8),
+        int(np.ceil((height + 2 * pad) / 8) * 8),
+    )
+
+
+def _place_window(
+    crop: tuple[int, int, int, int], size: tuple[int, int], shape: tuple[int, ...]
+) -> tuple[slice, slice]:
+    """Rows and columns of a window of one size for all frames, kept inside the image."""
+    width, height = min(size[0], shape[1] // 4 * 4), min(size[1], shape[0] // 4 * 4)
+    left = int(np.clip(crop[0] - width // 2, 0, shape[1] - width))
+    top = int(np.clip(crop[1] - height // 2, 0, shape[0] - height))
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _sigmoid(logit: np.ndarray) -> np.ndarray:
+    return (1.0 / (1.0 + np.exp(-np.clip(logit, -15, 15)))).astype(np.float32)

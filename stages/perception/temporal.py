@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from stages.perception.optical_flow import sample
+
 MISSING_AREA = 5e-4
 """A mask smaller than this fraction of the image counts as missing."""
 JUMP_IOU = 0.35
@@ -86,3 +88,26 @@ def main_component(mask: np.ndarray, anchor: np.ndarray | None = None, keep_shar
     holes, hole_labels, hole_stats, _ = cv2.connectedComponentsWithStats((~out).astype(np.uint8), connectivity=4)
     small = np.flatnonzero(hole_stats[1:, cv2.CC_STAT_AREA] < 0.01 * out.sum()) + 1
     return out | np.isin(hole_labels, small) if holes > 1 else out
+
+
+def flow_median(soft: np.ndarray, to_next: list[np.ndarray], to_previous: list[np.ndarray]) -> np.ndarray:
+    """(T, h, w) maps, each blended with the median of itself and its neighbours' along the flow.
+
+    `to_next[t]` is the flow t -> t+1 and `to_previous[t]` t+1 -> t, at any smaller size. What only one frame says, is
+    outvoted by the two beside it.
+    """
+    count, height, width = soft.shape
+    if count < 3:
+        return soft
+    out = soft.copy()
+    for t in range(1, count - 1):
+        before = sample(soft[t - 1], enlarge(to_previous[t - 1], width, height))
+        after = sample(soft[t + 1], enlarge(to_next[t], width, height))
+        out[t] = 0.4 * soft[t] + 0.6 * np.median([before, soft[t], after], axis=0)
+    return out
+
+
+def enlarge(flow: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A flow (h, w, 2) at another size, its lengths scaled along."""
+    scale = np.float32([width / flow.shape[1], height / flow.shape[0]])
+    return cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale
