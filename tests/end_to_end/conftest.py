@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import hashlib
 import os
 import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +21,31 @@ from synthetic.clips import write_clips
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
+
+@functools.cache
+def snapshot() -> Path:
+    """A copy of the program, so that editing the checkout while the tests run changes nothing under them."""
+    folder = Path(tempfile.mkdtemp(prefix="banmo-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy_program(ROOT, folder)
+    return folder
+
+
+def copy_program(source: Path, target: Path) -> None:
+    """Copy what ``banmo`` consists of."""
+    for package in ("pipeline", "stages", "workspace_template"):
+        shutil.copytree(source / package, target / package, ignore=shutil.ignore_patterns("__pycache__"))
+
+
 # A reconstruction in seconds: what it looks like is nobody's concern here.
 TINY = (
-    "--fit.steps=12", "--correct.steps=6", "--refine.steps=6",
+    *("--fit.iterations=120", "--fit.voxel=0.07", "--fit.bones=6", "--fit.limb_rounds=0", "--fit.motion_iterations=10"),
+    *("--correct.iterations=30", "--refine.iterations=60"),
+    *(f"--{phase}.{key}" for phase in ("fit", "correct", "refine") for key in (
+        "frames_per_step=4", "pixels_per_frame=24", "probe_samples=16", "fine_samples=4", "match_pixels=16"
+    )),
+    *("--export.resolution=48", "--export.faces=600", "--export.texture_px=128", "--export.video_side_px=96"),
+    "--export.turntable_frames=6",
 )  # fmt: skip
 
 
@@ -48,12 +73,13 @@ def environment() -> dict[str, str]:
 
 def run_banmo(
     *words: object,
-    code: Path = ROOT,
+    code: Path | None = None,
     python: tuple[str, ...] = (),
     before: tuple[str, ...] = (),
     timeout_s: float = 600.0,
 ) -> Outcome:
     """Run ``banmo`` with the code in `code`, as a user would; `python` are options of the interpreter."""
+    code = code or snapshot()
     command = [*before, sys.executable, *python, "-m", "pipeline.cli", *map(str, words)]
     variables = environment() | {"PYTHONPATH": str(code)}
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

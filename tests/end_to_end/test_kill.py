@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from tests.end_to_end.conftest import ROOT, TINY, Outcome, check_store, environment, run_banmo, view
+from tests.end_to_end.conftest import TINY, Outcome, check_store, environment, run_banmo, snapshot, view
 
 KILLS = int(os.environ.get("BANMO_SOAK", "4"))
 SEED = int(os.environ.get("BANMO_SOAK_SEED", "1"))
@@ -25,7 +25,7 @@ SEED = int(os.environ.get("BANMO_SOAK_SEED", "1"))
 def start(clips: Path, workspace: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "pipeline.cli", "run", str(clips), "--workspace", str(workspace), *TINY]
     return subprocess.Popen(
-        command, env=environment() | {"PYTHONPATH": str(ROOT)}, cwd=ROOT, start_new_session=True,
+        command, env=environment() | {"PYTHONPATH": str(snapshot())}, cwd=snapshot(), start_new_session=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
 

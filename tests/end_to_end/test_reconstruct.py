@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.end_to_end.conftest import ROOT, TINY, Outcome, check_store, contents, run_banmo, view
+from tests.end_to_end.conftest import TINY, Outcome, check_store, contents, copy_program, run_banmo, snapshot, view
 
 STAGES = ("frames", "masks", "flow", "features", "poses", "fit", "correct", "refine", "export")
 Finished = tuple[Path, Outcome]
@@ -111,13 +111,14 @@ def test_a_mask_setting_reruns_masks_and_followers_but_not_flow(clips: Path, con
     shutil.copytree(contracts, workspace / "cache")
     for k in (0, 1):  # no masks beside these: what the setting governs decides
         shutil.copyfile(clips / f"cat-0{k}.mp4", videos / f"cat-0{k}.mp4")
-    first = run_banmo("run", videos, "--workspace", workspace, "--until", "features")
+    quick = "--masks.self_training_steps=0"
+    first = run_banmo("run", videos, "--workspace", workspace, "--until", "features", quick)
     assert first.code == 0, first.text
     assert ran(first) == {"frames", "masks", "flow", "features"}
     flow_before = {k: v for k, v in view(workspace).items() if k.endswith("flow")}
     assert len(flow_before) == 2
 
-    change = ("--masks.threshold", "0.93")
+    change = ("--masks.threshold", "0.93", quick)
     why = run_banmo("why", "masks", "cat-00", "--workspace", workspace, *change)
     assert why.code == 0, why.text
     assert "threshold" in why.out and "0.5" in why.out and "0.93" in why.out
@@ -126,15 +127,14 @@ def test_a_mask_setting_reruns_masks_and_followers_but_not_flow(clips: Path, con
     assert "masks" in ran(second)
     assert "flow" not in ran(second) and "frames" not in ran(second)
     assert {k: v for k, v in view(workspace).items() if k.endswith("flow")} == flow_before
-    back = run_banmo("run", videos, "--workspace", workspace, "--until", "features")
+    back = run_banmo("run", videos, "--workspace", workspace, "--until", "features", quick)
     assert back.code == 0 and "up to date" in back.out, "the earlier result is still there"
 
 
 @pytest.fixture
 def code(tmp_path: Path) -> Path:
     """A copy of the program whose source a test may edit."""
-    for package in ("pipeline", "stages", "workspace_template"):
-        shutil.copytree(ROOT / package, tmp_path / "code" / package, ignore=shutil.ignore_patterns("__pycache__"))
+    copy_program(snapshot(), tmp_path / "code")
     return tmp_path / "code"
 
 
