@@ -241,7 +241,7 @@ def _measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray
     width, height, _ = pictures.scaled_size(clip.width, clip.height, side)
     intrinsics = pictures.scaled_intrinsics(posed.intrinsics, clip.width, clip.height, width, height)
     slack = 0.02 * rig.mesh.length
-    iou = np.full(len(clip), np.nan)
+    iou, missing, extra = np.full((3, len(clip)), np.nan)
     for i, source in enumerate(run.progress(clip.source_idx, label=f"quality {video.name}")):
         if "missing" in video.facts.flags[i]:
             continue
@@ -252,12 +252,15 @@ def _measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray
         if not mask.any():
             continue
         iou[i] = quality.mask_iou(fragments.covered, mask)
+        missing[i], extra[i] = quality.mask_misfit(fragments.covered, mask)
         normals = vertex_normals(points, rig.mesh.faces)
         views += quality.visible_vertices(points, normals, intrinsics, fragments, mask, slack)
     return quality.ClipQuality(
         video.name,
         clip.source_idx,
         iou,
+        missing,
+        extra,
         video.root_confidence,
         video.facts.confidence,
         video.facts.flags,

@@ -23,6 +23,12 @@ def mask_iou(silhouette: np.ndarray, mask: np.ndarray) -> float:
     return float((silhouette & mask).sum()) / union if union else 1.0
 
 
+def mask_misfit(silhouette: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
+    """Share of the mask that the model leaves uncovered, and area of the model beyond the mask over the mask's."""
+    area = max(float(mask.sum()), 1.0)
+    return float((mask & ~silhouette).sum()) / area, float((silhouette & ~mask).sum()) / area
+
+
 def visible_vertices(
     vertices_camera: np.ndarray,
     normals_camera: np.ndarray,
@@ -70,11 +76,16 @@ def unseen_side(areas: np.ndarray, normals: np.ndarray, seen: np.ndarray) -> str
 
 @dataclass(frozen=True)
 class ClipQuality:
-    """Figures of one video. Arrays are a kept frame each; NaN where there is nothing to compare with."""
+    """Figures of one video. Arrays are a kept frame each; NaN where there is nothing to compare with.
+
+    missing: share of the mask that the model does not cover; extra: area of the model beyond the mask, over the mask's.
+    """
 
     name: str
     source_idx: np.ndarray
     iou: np.ndarray
+    missing: np.ndarray
+    extra: np.ndarray
     root_confidence: np.ndarray
     mask_confidence: np.ndarray
     flags: list[list[str]]
@@ -92,11 +103,14 @@ class ClipQuality:
             if self.root_confidence[i] < POOR_CONFIDENCE:
                 flags.append("pose")
             row: dict[str, Any] = {"source_idx": int(self.source_idx[i]), "iou": number(self.iou[i])}
+            row |= {"missing": number(self.missing[i]), "extra": number(self.extra[i])}
             row |= {"root_confidence": number(self.root_confidence[i])}
             rows.append(row | {"mask_confidence": number(self.mask_confidence[i]), "flags": flags})
         return {
             "iou_mean": mean_number(self.iou),
             "iou_worst": number(np.nanmin(self.iou)) if np.isfinite(self.iou).any() else None,
+            "missing_mean": mean_number(self.missing),
+            "extra_mean": mean_number(self.extra),
             "root_confidence_mean": mean_number(self.root_confidence),
             "mask_confidence_mean": mean_number(self.mask_confidence),
             "kept_frames": len(self.source_idx),
@@ -160,6 +174,11 @@ def judge(
         if np.nanmean(np.append(clip.iou, np.nan if np.isfinite(clip.iou).any() else 1.0)) < POOR_OUTLINE:
             share = float((clip.iou[np.isfinite(clip.iou)] < POOR_OUTLINE).mean())
             advice.append(f"{clip.name}: the model misses the object's outline in {share:.0%} of the frames.")
+        missing, extra = mean_number(clip.missing) or 0.0, mean_number(clip.extra) or 0.0
+        if missing > 0.12:
+            advice.append(f"{clip.name}: {missing:.0%} of the object is not in the model; look for lost or thin limbs.")
+        if extra > 0.25:
+            advice.append(f"{clip.name}: the model covers {extra:.0%} more than the object does; it is too fat or off.")
         poor = float((clip.mask_confidence < POOR_CONFIDENCE).mean())
         if poor > 0.25:
             advice.append(f"{clip.name}: {poor:.0%} of the frames have poor masks; put better ones beside the video.")

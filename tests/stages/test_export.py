@@ -253,6 +253,7 @@ def test_the_report_measures_what_it_says(result: tuple[Result, Path, Run]) -> N
     assert report["verdict"] == "good" and report["trust"] > 0.75
     assert run.metrics["iou_mean"] == report["iou_mean"]
     frames = report["videos"][NAMES[0]]["frames"]
+    assert max(f["missing"] for f in frames) < 0.04 and max(f["extra"] for f in frames) < 0.04
     assert [f["source_idx"] for f in frames] == [0, 1, 3, 4, 5]
     assert report["videos"][NAMES[0]]["source_frames"] == FRAMES
     seen = trimesh.load(out / "rest.ply", process=False)
@@ -280,6 +281,13 @@ class Inflated(Chain):
         return super().sdf(points) - 0.3
 
 
+class Shortened(Chain):
+    """A model that lost a limb: the right third of the chain."""
+
+    def sdf(self, points: torch.Tensor) -> torch.Tensor:
+        return torch.maximum(super().sdf(points), points[:, 0] - 0.3)
+
+
 class Nothing(Chain):
     """A model whose optimisation lost the surface."""
 
@@ -296,7 +304,13 @@ class Twisted(Chain):
 
 @pytest.mark.parametrize(
     ("model", "sentence"),
-    [(Inflated, "misses the object's outline"), (Nothing, "without a surface"), (Twisted, "follows the model only to")],
+    [
+        (Inflated, "too fat"),
+        (Shortened, "not in the model"),
+        (Inflated, "misses the object's outline"),
+        (Nothing, "without a surface"),
+        (Twisted, "follows the model only to"),
+    ],
 )
 def test_a_bad_result_says_so(model: type[Chain], sentence: str, stand_in: dict[str, Chain], tmp_path: Path) -> None:
     made = Result(Chain(["v"], bones=3), tmp_path)
@@ -306,7 +320,7 @@ def test_a_bad_result_says_so(model: type[Chain], sentence: str, stand_in: dict[
     report = formats.read_json(out / "quality.json")
     if model is Twisted:
         assert report["skinning_error"] == pytest.approx(0.05 * np.sqrt(3) / 2, rel=0.3)
-    else:
+    elif model is not Shortened:
         assert report["verdict"] == "doubtful"
 
 
