@@ -23,7 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pipeline import Folder, Resources, Run, Scene, stage
+from pipeline import BadInput, Folder, Resources, Run, Scene, stage
 from stages import formats
 from stages.export_files import (
     ExportedVideo,
@@ -65,6 +65,16 @@ class ExportSettings:
     """Pictures of one turn, at 24 a second."""
 
 
+_RANGES = {
+    "resolution": (16, 1024),
+    "faces": (20, 2_000_000),
+    "influences": (1, 32),
+    "texture_px": (0, 8192),
+    "video_side_px": (16, 2048),
+    "turntable_frames": (1, 2000),
+}
+
+
 @stage(per=Scene, version=1, needs=Resources(cpus=1))
 def export(
     refine: Folder,
@@ -76,6 +86,9 @@ def export(
     run: Run,
 ) -> None:
     """A rigged and animated GLB, meshes and cameras of every frame, videos to look at, and how far to trust them."""
+    for key, (least, most) in _RANGES.items():
+        if not least <= getattr(settings, key) <= most:
+            raise BadInput(f"[export] {key} = {getattr(settings, key)} is not between {least} and {most}")
     model = Banmo.restore(*formats.read_model(refine.path))
     inputs = []
     for name in model.video_names:

@@ -1,5 +1,6 @@
 """The export stage on a closed-form stand-in: files, figures, the GLB's own kinematics, determinism, honesty."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -12,7 +13,7 @@ import pytest
 import torch
 import trimesh
 
-from pipeline import Folder, Run
+from pipeline import BadInput, Folder, Run
 from stages import export as stage_module
 from stages import formats
 from stages.export import ExportSettings, export
@@ -338,6 +339,15 @@ def test_doubtful_masks_poses_and_missing_objects_are_told(stand_in: dict[str, C
     report = formats.read_json(out / "quality.json")
     assert report["verdict"] == "doubtful"
     assert [f["iou"] is None for f in report["videos"]["v"]["frames"]] == [True, True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    "key", ["resolution", "faces", "influences", "texture_px", "video_side_px", "turntable_frames"]
+)
+def test_senseless_settings_are_refused_in_one_sentence(key: str, tmp_path: Path) -> None:
+    settings = dataclasses.replace(SETTINGS, **{key: -1})
+    with pytest.raises(BadInput, match=rf"\[export\] {key} = -1 is not between"):
+        export(Folder(tmp_path), {}, {}, Folder(tmp_path), settings, tmp_path, Run())
 
 
 def test_the_check_refuses_a_folder_that_lacks_a_frame(stand_in: dict[str, Chain], tmp_path: Path) -> None:
