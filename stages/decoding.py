@@ -116,13 +116,13 @@ def _reason(error: BaseException) -> str:
 
 def _rotation_deg(frame: av.VideoFrame) -> int:
     """Clockwise rotation that puts the decoded picture upright, a multiple of 90 degrees."""
-    return int(round(-float(frame.rotation) / 90.0)) * 90 % 360
+    return round(-float(frame.rotation) / 90.0) * 90 % 360
 
 
 def _upright(frame: av.VideoFrame, aspect: float) -> tuple[np.ndarray, int]:
     image = frame.to_ndarray(format="rgb24")
     if abs(aspect - 1.0) > 0.01:  # non-square pixels: widen or narrow, never throw rows away
-        width = max(1, int(round(image.shape[1] * aspect)))
+        width = max(1, round(image.shape[1] * aspect))
         image = cv2.resize(image, (width, image.shape[0]), interpolation=cv2.INTER_AREA)
     turn = _rotation_deg(frame)
     return np.ascontiguousarray(np.rot90(image, -turn // 90)) if turn else image, turn

@@ -25,7 +25,7 @@ from stages.formats import (
     write_image,
     write_json,
 )
-from stages.networks import FeatureNetwork
+from stages.networks import NO_FILE, FeatureNetwork
 from stages.perception.descriptors import crop_box, crop_resize, describe_appearance, match_trust, normalise
 from stages.perception.sheets import feature_sheet
 
@@ -34,9 +34,9 @@ from stages.perception.sheets import feature_sheet
 class FeatureSettings:
     """Settings of the `features` stage."""
 
-    network: InputFile = InputFile("")
+    network: InputFile = NO_FILE
     """An ONNX file that turns a 1x3xHxW crop into 1x16xhxw (or 1x17xhxw, mask logit first); empty for none."""
-    network_contract: InputFile = InputFile("")
+    network_contract: InputFile = NO_FILE
     """A small TOML file that says what that network expects; empty for sane defaults."""
     category: str = "other"
     """What the network knows: written down for the stages that follow."""

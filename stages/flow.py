@@ -27,7 +27,7 @@ from stages.formats import (
     write_image,
     write_json,
 )
-from stages.networks import FlowNetwork
+from stages.networks import NO_FILE, FlowNetwork
 from stages.perception.optical_flow import FlowPair, chained_pairs, direct_pairs, new_matcher, round_trip_error
 from stages.perception.sheets import flow_colours, pick, tile
 
@@ -42,9 +42,9 @@ class FlowSettings:
     """Preset of DIS: ultrafast, fast or medium."""
     dilate: float = 0.02
     """Flow is kept this far outside the mask, as a fraction of the longer side."""
-    network: InputFile = InputFile("")
+    network: InputFile = NO_FILE
     """An ONNX file of two pictures in, flow out (the OpenCV zoo's RAFT as it is); empty for none."""
-    network_contract: InputFile = InputFile("")
+    network_contract: InputFile = NO_FILE
     """A small TOML file that says what that network expects; empty for RAFT's contract."""
 
 

@@ -30,7 +30,7 @@ from stages.formats import (
     write_image,
     write_mask_facts,
 )
-from stages.networks import MaskNetwork
+from stages.networks import NO_FILE, MaskNetwork
 from stages.perception.background import shrink
 from stages.perception.optical_flow import new_matcher, sample
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
@@ -51,9 +51,9 @@ class MaskSettings:
     """Steps in which the built-in segmentation fits its small network to the clip; 0 leaves that network out."""
     seed: int = 0
     """Seed of the built-in segmentation."""
-    network: InputFile = InputFile("")
+    network: InputFile = NO_FILE
     """An ONNX file that turns a 1x3xHxW picture into a 1x1xHxW mask (u2net, isnet, birefnet ...); empty for none."""
-    network_contract: InputFile = InputFile("")
+    network_contract: InputFile = NO_FILE
     """A small TOML file that says what that network expects (see docs/workspace.md); empty for sane defaults."""
 
 

@@ -26,9 +26,10 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from pipeline import BadInput
+from pipeline import BadInput, InputFile
 from stages.onnx_safety import external_data
 
+NO_FILE = InputFile("")
 MAX_BYTES = 2_000_000_000
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -1,7 +1,8 @@
 """How the object looks in this very clip: small classifiers fitted to the clip's own uncertain labels, then read back.
 
 Labels come from motion; a classifier of low capacity cannot copy their errors, so what it predicts is cleaner than
-what it was taught. First pixel by pixel on colour (`PixelColours`), then with surroundings by a small convolutional network.
+what it was taught. First pixel by pixel on colour (`PixelColours`), then with surroundings by a small convolutional
+network (`ClipNetwork`).
 """
 
 from __future__ import annotations

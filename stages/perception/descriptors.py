@@ -10,10 +10,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.formats import FEATURE_CHANNELS, FEATURE_SIZE
-
 CROP_MARGIN = 1.2
+CHANNELS = 16
+CROP_CELLS = 112
 SCALES_CELLS = (0.8, 3.0, 8.0)
+LEAST_GAP = 0.02  # descriptor distance below which two matches are as good as equal
 CHROMA_UNIT, LIGHT_UNIT, TEXTURE_UNIT = 12.0, 0.35, 0.12
 
 
@@ -29,14 +30,14 @@ def crop_box(box: np.ndarray, width: int, height: int, margin: float = CROP_MARG
     return np.concatenate([centre - half, centre + half])
 
 
-def crop_resize(image: np.ndarray, crop: np.ndarray, side: int = FEATURE_SIZE) -> np.ndarray:
+def crop_resize(image: np.ndarray, crop: np.ndarray, side: int = CROP_CELLS) -> np.ndarray:
     """An image (H, W) or (H, W, C) on the crop's grid of `side` x `side` cells; zero outside the image.
 
     Cell (r, c) is centred on pixel x0 + (c + 0.5) (x1 - x0) / side; averaged over its area when that is larger than a
     pixel.
     """
     step = (crop[2] - crop[0]) / side
-    whole = max(1, int(round(step)))  # so many samples a cell and axis, then averaged
+    whole = max(1, round(step))  # so many samples a cell and axis, then averaged
     fine = side * whole
     centres = (np.arange(fine, dtype=np.float32) + 0.5) * np.float32((crop[2] - crop[0]) / fine) - 0.5
     columns, rows = np.meshgrid(centres + np.float32(crop[0]), centres + np.float32(crop[1]))
@@ -51,7 +52,7 @@ def describe_appearance(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     band-pass energy at two (2), depth inside the outline (1), height in the mask (1), a constant (1).
     """
     inside = mask > 0.5
-    out = np.zeros((*mask.shape, FEATURE_CHANNELS), np.float32)
+    out = np.zeros((*mask.shape, CHANNELS), np.float32)
     if not inside.any():
         return out
     lab = cv2.cvtColor(image.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
@@ -115,6 +116,6 @@ def match_trust(features: np.ndarray, rng: np.random.Generator, pairs: int = 24,
         apart = np.linalg.norm(place[None] - place[best][:, None], axis=-1) > 0.2 * side
         second_best = np.where(apart, distance, np.inf).min(axis=1)
         ok = np.isfinite(second_best)
-        found.append(1.0 - distance[np.arange(len(chosen)), best][ok] / np.maximum(second_best[ok], 1e-6))
+        found.append(1.0 - (distance[np.arange(len(chosen)), best][ok] + LEAST_GAP) / (second_best[ok] + LEAST_GAP))
     values = np.concatenate(found) if found else np.zeros(0)
     return float(values.mean()) if len(values) else 0.0

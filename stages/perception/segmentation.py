@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -60,7 +61,7 @@ class Carrier:
         grey = [cv2.cvtColor(shrink(image, CARRY_SIDE_PX), cv2.COLOR_RGB2GRAY) for image in work]
         matcher = new_matcher("fast")
         self.size = grey[0].shape[::-1]
-        pairs = list(zip(grey[:-1], grey[1:], strict=True))
+        pairs = list(pairwise(grey))
         self.to_next = [matcher.calc(a, b, None) for a, b in pairs]  # frame t -> t+1
         self.to_previous = [matcher.calc(b, a, None) for a, b in pairs]  # frame t+1 -> t
 
