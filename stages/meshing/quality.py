@@ -190,6 +190,8 @@ def judge(
     if pose_advice:
         advice.append(pose_advice)
     if unseen > 0.15:
+        if parts["root_poses"] < POOR_CONFIDENCE:
+            side = None  # the model's axes mean nothing then
         where = f", mostly its {side} side: add a clip from there" if side else ": add clips from other sides"
         advice.append(f"{unseen:.0%} of the surface was never seen{where}.")
     worst = max((c.skinning_error_8 for c in clips), default=0.0)
