@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -19,20 +19,22 @@ class Cues:
 
     mask: np.ndarray  # (T, S, S) float32, foreground probability
     colour: np.ndarray  # (T, S, S, 3) float32, 0..1, zero off the object
-    flow_px: np.ndarray  # (T, S, S, 2) float32, full-image pixels to the next frame; the last row is zero
-    flow_confidence: np.ndarray  # (T, S, S) float32; the last row is zero
+    flow_px: np.ndarray  # (T, S, S, 2) float32, full-image pixels to the frame `flow_step` later; zero at the end
+    flow_confidence: np.ndarray  # (T, S, S) float32; zero at the end
     centre_px: np.ndarray  # (T, 2) float64
     half_px: np.ndarray  # (T,) float64, half the crop's side
     box_px: np.ndarray  # (T, 4) float64, x0 y0 x1 y1
     known: np.ndarray  # (T,) bool, the mask shows an object
     cut: np.ndarray  # (T,) bool, the object is cut off by the picture's border
+    flow_step: int = 1
 
     def __len__(self) -> int:
         return len(self.mask)
 
     def select(self, frame_idx: np.ndarray) -> Cues:
-        """The cues of some frames (their flow still leads to the next frame of the whole clip)."""
-        return Cues(**{name: getattr(self, name)[frame_idx] for name in self.__dataclass_fields__})
+        """The cues of some frames (their flow still leads to where it led in the whole clip)."""
+        parts = {f.name: getattr(self, f.name)[frame_idx] for f in fields(self) if f.name != "flow_step"}
+        return Cues(**parts, flow_step=self.flow_step)
 
 
 def square_crop(image: np.ndarray, centre_px: np.ndarray, half_px: float, size: int) -> np.ndarray:

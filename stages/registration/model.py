@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, interpolate
 
 from stages.registration.placing import smooth
 from stages.registration.tracking import azimuth_steps, elevation_step, forward_backward
@@ -66,6 +66,15 @@ class Hypothesis:
         """Forget the optimiser's momentum."""
         groups = [{"params": [self.logit], "lr": 0.4}, {"params": [self.colour], "lr": 0.1}]
         self.optimiser = torch.optim.Adam(groups, betas=(0.8, 0.95))
+
+    def start_from(self, other: Hypothesis) -> None:
+        """Take over another hypothesis's volume, resampled to this one's voxels, and its scale of every frame."""
+        both = torch.cat([other.logit.detach()[None], other.colour.detach()])[None]
+        both = interpolate(both, size=(self.voxels,) * 3, mode="trilinear", align_corners=False)[0]
+        self.logit, self.colour = both[0].clone().requires_grad_(), both[1:].clone().requires_grad_()
+        self.units = [u.clone() for u in other.units]
+        self.evidence = other.evidence
+        self.restart()
 
     def copy(self) -> Hypothesis:
         """An independent copy that shares only what never changes."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.registration.answer import Answer, Subject, Tell
-from stages.registration.cues import CROP_MARGIN, inflate
+from stages.registration.cues import CROP_MARGIN
 from stages.registration.model import Hypothesis, Sequence, Weights
 from stages.registration.placing import smooth, view_angles, view_rotation
 from stages.registration.tracking import posterior_angles
-from stages.registration.turning import turn_rates
+from stages.registration.turning import expected_turns
 from stages.registration.volume import ViewBank
 from stages.registration.windows import Windows, whiten_together
 
@@ -35,7 +35,7 @@ class Effort:
 
 
 COARSE_ELEVATION = np.radians([18.0])
-FINE_ELEVATION = np.radians([-5.0, 10.0, 25.0, 42.0])
+FINE_ELEVATION = np.radians([8.0, 18.0, 28.0])
 AZIMUTHS = 36
 MARGIN = 0.004
 """Difference of evidence (cost a frame) at which two hypotheses are told apart with some confidence."""
@@ -44,7 +44,7 @@ MARGIN = 0.004
 def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effort()) -> dict[str, Answer]:
     """Answers for every clip whose poses are not given."""
     chosen = choose_frames([len(s.cues) for s in subjects], effort.frames)
-    drifts = [flow_turns(s) for s in subjects]
+    drifts = [expected_turns(s.cues) for s in subjects]
     bank = ViewBank(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, COARSE_ELEVATION, effort.coarse_px)
     sequences = make_sequences(subjects, chosen, drifts, bank)
     total = effort.starts * 6 + max(2, effort.starts // 3) * effort.rounds + 3 * effort.fine_rounds
@@ -79,13 +79,6 @@ def choose_frames(lengths: list[int], most: int) -> list[np.ndarray]:
         np.unique(np.round(np.linspace(0, n - 1, min(n, max(8, int(w))))).astype(np.int64))
         for n, w in zip(lengths, wanted, strict=True)
     ]
-
-
-def flow_turns(subject: Subject) -> np.ndarray:
-    """(T,) turn about the vertical from each frame to the next, radians, as the flow suggests; see turn_rates."""
-    relief = inflate(subject.cues.mask) * 2 / subject.cues.mask.shape[1]
-    rates, _ = turn_rates(subject.cues, relief)
-    return np.clip(smooth(rates[:, 1], 2.0), -0.2, 0.2)
 
 
 def make_sequences(
@@ -164,7 +157,7 @@ def finer(
     bank = ViewBank(hypothesis.bank.azimuth, FINE_ELEVATION, effort.fine_px)
     sequences = make_sequences(subjects, chosen, drifts, bank)
     fine = Hypothesis(sequences, bank, effort.fine_px, hypothesis.weights, 0)
-    fine.units = [u.clone() for u in hypothesis.units]
+    fine.start_from(hypothesis)
     for k, s in enumerate(sequences):
         azimuth, elevation, _ = posterior_angles(hypothesis.posterior[k], bank.azimuth, hypothesis.bank.elevation)
         fine.posterior[k] = spread(bank, azimuth, elevation) if s.fixed is None else s.fixed

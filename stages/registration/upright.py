@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from stages.registration.answer import Answer, Subject, Tell
-from stages.registration.cues import inflate
-from stages.registration.placing import OBJECT_SIZE, smooth, view_rotation
-from stages.registration.turning import turn_rates
+from stages.registration.placing import OBJECT_SIZE, view_rotation
+from stages.registration.turning import expected_turns
 
 ELEVATION = np.radians(15.0)
 """People film what stands on the ground from a little above."""
@@ -20,11 +19,9 @@ def upright(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]
     for done, subject in enumerate(subjects):
         tell(done, len(subjects), "upright poses")
         cues = subject.cues
-        relief = inflate(cues.mask) * 2 / cues.mask.shape[1]
-        rates, trust = turn_rates(cues, relief)
         # a turn of the object by +w about the camera's y (down) moves the camera's azimuth by +w
-        azimuth = np.concatenate([[0.0], np.cumsum(smooth(rates[:, 1], 2.0)[:-1])])
+        azimuth = np.concatenate([[0.0], np.cumsum(expected_turns(cues)[:-1])])
         rotation = view_rotation(azimuth, np.full(len(cues), ELEVATION))
         extent = np.full(len(cues), OBJECT_SIZE)
-        answers[subject.name] = Answer("upright", rotation, extent, 0.1 * trust * cues.known, 0.05)
+        answers[subject.name] = Answer("upright", rotation, extent, 0.1 * cues.known, 0.05)
     return answers
