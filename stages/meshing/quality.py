@@ -160,6 +160,7 @@ def judge(
     roots = pose_trust if pose_trust is not None else _mean([c.root_confidence for c in clips])
     parts = {
         "outline": float(np.clip((iou - 0.4) / 0.45, 0, 1)),
+        "complete": float(np.clip(1 - 3 * (_mean([c.missing for c in clips]) - 0.05), 0, 1)),
         "masks": float(np.clip(masks, 0, 1)),
         "root_poses": float(np.clip(roots, 0, 1)),
         "seen": float(np.clip(1.5 * (1 - unseen), 0, 1)),
@@ -175,7 +176,7 @@ def judge(
             share = float((clip.iou[np.isfinite(clip.iou)] < POOR_OUTLINE).mean())
             advice.append(f"{clip.name}: the model misses the object's outline in {share:.0%} of the frames.")
         missing, extra = mean_number(clip.missing) or 0.0, mean_number(clip.extra) or 0.0
-        if missing > 0.12:
+        if missing > 0.1:
             advice.append(f"{clip.name}: {missing:.0%} of the object is not in the model; look for lost or thin limbs.")
         if extra > 0.25:
             advice.append(f"{clip.name}: the model covers {extra:.0%} more than the object does; it is too fat or off.")

@@ -135,6 +135,7 @@ def test_no_part_makes_up_for_another() -> None:
     assert result.trust == pytest.approx(0.1) and result.word == "doubtful"
     assert not any("left" in advice for advice in result.advice)
     assert verdict([clip()], level=0.1).trust == 0.0
+    assert verdict([clip(missing=0.16)]).word == "usable with care"  # an arm and a bit of a person
 
 
 def test_numbers_are_fit_for_json() -> None:
