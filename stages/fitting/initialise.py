@@ -146,7 +146,9 @@ def build(
     """A model whose shape is the solid voxels (N, 3), with `bones` bones in it and `margin` around it."""
     bounds = torch.stack([solid.amin(0) - margin, solid.amax(0) + margin])
     generator = torch.Generator().manual_seed(seed)
-    model = Banmo(architecture, videos, poses, bounds, place_bones(solid, bones, seed), generator)
+    with torch.random.fork_rng(devices=[]):  # layers draw their first weights from torch's own generator
+        torch.manual_seed(seed)
+        model = Banmo(architecture, videos, poses, bounds, place_bones(solid, bones, seed), generator)
     if isinstance(model.field, GridField):
         set_shape(model.field, solid, solid_voxel)
     return model
