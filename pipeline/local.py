@@ -88,6 +88,7 @@ class Job:
         self.started = time.monotonic()
         self.last_sign = self.started
         self.told_silent = False
+        self.spent_s = float(request["spent_s"])
         self._stop_by: float | None = None
         self._killed = False
         environment = child_environment(Path(request["package_dir"]))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
+from pipeline.files import read_json
 from pipeline.graph import Node
 from pipeline.plan import Planner, Step
 from pipeline.settings import stage_values
@@ -32,14 +32,24 @@ def build_request(planner: Planner, step: Step, run: str, cpus: int, gpus: list[
         "settings": stage_values(planner.settings, info),
         "inputs": _folders(planner, node),
         "sources": [_source(planner, node, v) for v in videos],
-        "forced": node in planner.forced,
+        "supersedes": step.record.finished if step.record and node in planner.forced else None,
+        "spent_s": _spent_before(planner, step.action.key),
         "run": run,
-        "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
         "device": "cuda" if gpus else "cpu",
         "threads": cpus,
         "grace_s": planner.settings.execution.grace_s,
         "watch_parent": True,
     }
+
+
+def _spent_before(planner: Planner, key: str) -> float:
+    """Seconds that stopped attempts have put into the checkpoint this one goes on from."""
+    workspace = planner.workspace
+    note = read_json(workspace.attempts / f"{key}.json")
+    if not isinstance(note, dict) or not (workspace.checkpoints / key).is_dir():
+        return 0.0
+    spent = note.get("spent_s")
+    return float(spent) if isinstance(spent, int | float) else 0.0
 
 
 def _folders(planner: Planner, node: Node) -> dict[str, Any]:

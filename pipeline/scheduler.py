@@ -74,6 +74,7 @@ class Scheduler:
         self._ready = [s.node for s in steps if s.status == RUN]
         self._jobs: dict[Node, Job] = {}
         self._order = {node.label: i for i, node in enumerate(planner.graph.nodes)}
+        self._seen_results = (-1, -1)
         self._signals = 0
         self._grace_s = planner.settings.execution.grace_s
         for step in steps:
@@ -116,6 +117,10 @@ class Scheduler:
         return next((label for label in self._unknown_inputs(node) if label in lost), None)
 
     def _decide_waiting(self) -> None:
+        """Look at the waiting nodes again, if anything has happened since."""
+        if self._seen_results == self._results_so_far():
+            return
+        self._seen_results = self._results_so_far()
         for node in list(self._waiting):
             blocker = self._blocked_by(node)
             if blocker is not None:
@@ -124,7 +129,6 @@ class Scheduler:
                 self._tell(node, {"event": "blocked", "text": blocker})
             elif not self._unknown_inputs(node):
                 self._waiting.remove(node)
-                self.planner.workspace.ledger.refresh()
                 step = self.planner.decide(node)
                 self._steps[node.label] = step
                 if step.status == HIT:
@@ -135,6 +139,11 @@ class Scheduler:
                     self._tell(node, {"event": "blocked", "text": "a decision"})
                 else:
                     self._ready.append(node)
+
+    def _results_so_far(self) -> tuple[int, int]:
+        report = self.report
+        lost = len(report.failed) + len(report.bad_input) + len(report.interrupted) + len(report.blocked)
+        return len(self.planner.results), lost
 
     def _show_hit(self, step: Step) -> None:
         assert step.record is not None
@@ -221,6 +230,7 @@ class Scheduler:
                 note.unlink(missing_ok=True)
                 self._result(node, record.digest)
         if outcome.status != "done":
+            spent = seconds + job.spent_s if outcome.status == "interrupted" else 0.0
             if outcome.status == "interrupted" and not self._stopping():
                 outcome = Outcome("failed", outcome.message + " although nobody asked")
             write_json(
@@ -230,6 +240,7 @@ class Scheduler:
                     "message": outcome.message,
                     "log": os.path.relpath(job.log_path, self.workspace.root),
                     "label": node.label,
+                    "spent_s": spent,
                     "time": time.time(),
                 },
             )

@@ -6,7 +6,6 @@ are the fields of that stage's settings class. On the command line: ``--stage.ke
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import tomllib
 from dataclasses import dataclass, field
@@ -258,13 +257,15 @@ def toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in value)
-        return f'"{escaped}"'
+        return '"' + "".join(_toml_character(c) for c in value) + '"'
     if isinstance(value, list | tuple):
         return "[" + ", ".join(toml_value(v) for v in value) + "]"
     return repr(value)
 
 
-def own_fields() -> dict[str, list[str]]:
-    """Names of the engine's own settings, by section."""
-    return {name: [f.name for f in dataclasses.fields(kind)] for name, kind in _OWN.items()}
+def _toml_character(character: str) -> str:
+    if character.isprintable() and character not in '"\\':
+        return character
+    if 0xD800 <= ord(character) < 0xE000:  # a byte of a path that is not UTF-8; TOML cannot say it
+        return "\ufffd"
+    return f"\\U{ord(character):08x}"

@@ -138,8 +138,8 @@ class Worker:
             lease.release()
 
     def _serves(self, record: Record) -> bool:
-        if self.request["forced"] and record.finished <= self.request["created"]:
-            return False
+        if record.finished == self.request["supersedes"]:
+            return False  # this is the one that the user wants made again
         return self.workspace.objects.sound(record.stage, record.digest)
 
     def _make(self) -> None:
@@ -167,7 +167,7 @@ class Worker:
             digest=stored.digest,
             files=stored.files,
             bytes=stored.bytes,
-            seconds=round(time.monotonic() - clock, 3),
+            seconds=round(time.monotonic() - clock + request["spent_s"], 3),
             started=_stamp(started),
             finished=_stamp(datetime.now(UTC)),
             run=request["run"],

@@ -66,8 +66,10 @@ class Lab:
     def spawn(self, *words: str, env: dict[str, str] | None = None) -> subprocess.Popen[str]:
         """``banmo run`` in a process of its own, leader of its group."""
         return subprocess.Popen(
-            [sys.executable, "-m", "pipeline.cli", "run", "--workspace", str(self.workspace)]
-            + ["--definition", str(self.package), *words, str(self.clips)],
+            [
+                *(sys.executable, "-m", "pipeline.cli", "run", "--workspace", str(self.workspace)),
+                *("--definition", str(self.package), *words, str(self.clips)),
+            ],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ class WordSettings:
     """How many files to make."""
     delay_s: float = 0.0
     """Time each one takes."""
-    table: InputFile = InputFile("")
+    table: InputFile = InputFile("")  # noqa: RUF009  (immutable)
     """Some file that matters by its content."""
     trouble: str = ""
     """What goes wrong."""
@@ -28,7 +29,7 @@ class WordSettings:
 @stage(per=Video, version=1, given=(".hint.txt", ".extra"))
 def words(video: Source, given: Given, settings: WordSettings, out: Path, run: Run) -> None:
     """Words of a video."""
-    print("garbage on standard output \x00\xff {not json")
+    sys.stdout.write("garbage on standard output \x00\xff {not json\n")
     if video.is_folder:
         text = " ".join(p.name for p in sorted(video.path.iterdir()))
     else:
