@@ -142,8 +142,9 @@ def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
     if name == "init":
         add("directory", nargs="?", type=Path, metavar="DIR", help="folder to make (default: --workspace)")
     add("--workspace", type=Path, default=Path("workspace"), metavar="DIR", help="default: ./workspace")
-    if name in ("run", "status", "why", "inspect", "graph", "settings", "bless", "gc", "export", "doctor"):
+    if name not in ("verify", "pin", "log"):
         add("--definition", default="", metavar="PACKAGE", help="package that defines the pipeline (default: stages)")
+    if name in ("run", "status", "why", "inspect", "graph", "settings", "bless", "gc", "export"):
         add("--preset", metavar="NAME", help="settings by purpose; see `banmo settings`")
         add("--skip-video", action="append", default=[], metavar="VIDEO", help="leave a video out")
         add("--set", metavar="STAGE.KEY=VALUE", help=_SETTINGS_HELP)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.definition import Definition, load
+from pipeline.definition import Definition, load, locate
 from pipeline.errors import BadInput
 from pipeline.graph import Graph, Node, Selection, find_video, select
 from pipeline.plan import Planner
@@ -46,12 +46,9 @@ class Project:
         """Open a workspace; `recall` takes the command-line settings of the last run where none are given now."""
         if create:
             precheck(options)
-        workspace = Workspace.open(options.workspace, create=create)
+        workspace = Workspace.open(options.workspace, create=create, template=template_of(options))
         memory = workspace.remembered()
-        package = options.definition or os.environ.get("BANMO_DEFINITION", "")
-        package = package or str(memory.get("definition") or "stages")
-        if "/" in package:
-            package = str(Path(package).resolve())
+        package = package_of(options, memory)
         definition = load(package, workspace.cache)
         overrides, preset, skip = list(options.overrides), options.preset, list(options.skip_videos)
         if recall and not overrides and preset is None and not skip:
@@ -82,6 +79,19 @@ class Project:
     def select(self, selection: Selection) -> tuple[list[Node], set[Node]]:
         """Nodes a command is about, and those that must run again."""
         return select(self.graph, selection)
+
+
+def package_of(options: Options, memory: dict[str, Any]) -> str:
+    """The package that defines the pipeline: named now, by the environment (tests), last time, or the default."""
+    package = options.definition or os.environ.get("BANMO_DEFINITION", "") or str(memory.get("definition") or "stages")
+    return str(Path(package).resolve()) if "/" in package else package
+
+
+def template_of(options: Options) -> Path | None:
+    """The workspace template that lies beside the pipeline's package, for a workspace that is not there yet."""
+    if (options.workspace / "FORMAT").is_file():
+        return None
+    return locate(package_of(options, {})).parent / "workspace_template"
 
 
 def precheck(options: Options) -> None:

@@ -50,8 +50,11 @@ class Workspace:
         self.ledger = Ledger(self.root / "actions")
 
     @classmethod
-    def open(cls, root: Path, *, create: bool = False) -> Workspace:
-        """Open a workspace, or make one. Raises BadInput when it is not one, or of a later format."""
+    def open(cls, root: Path, *, create: bool = False, template: Path | None = None) -> Workspace:
+        """Open a workspace, or make one from a `template` folder.
+
+        Raises BadInput when it is not one, or of a later format.
+        """
         workspace = cls(root)
         mark = workspace.root / "FORMAT"
         if mark.is_file():
@@ -67,17 +70,16 @@ class Workspace:
                 where=workspace.root,
                 hint="`banmo run VIDEOS` makes one, or name it by --workspace",
             )
-        workspace.create()
+        workspace.create(template)
         return workspace
 
-    def create(self) -> None:
+    def create(self, template: Path | None = None) -> None:
         """Make the folder from the template; what is there already stays as it is."""
         if self.root.exists() and not self.root.is_dir():
             raise BadInput("this is a file, not a folder", where=self.root)
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            template = template_dir()
-            if template is not None:
+            if template is not None and template.is_dir():
                 for path in sorted(template.iterdir()):
                     if path.is_file() and path.name != "__init__.py" and not (self.root / path.name).exists():
                         shutil.copyfile(path, self.root / path.name)
@@ -161,9 +163,3 @@ class Workspace:
         """Bytes an ordinary user may still write."""
         status = os.statvfs(self.root)
         return status.f_bavail * status.f_frsize
-
-
-def template_dir() -> Path | None:
-    """The folder that ``init`` copies, if it is installed beside the engine."""
-    path = Path(__file__).resolve().parent.parent / "workspace_template"
-    return path if (path / "README.md").is_file() else None

@@ -16,7 +16,7 @@ from pipeline.exports import export
 from pipeline.files import write_json
 from pipeline.ledger import Record
 from pipeline.plan import HIT, RUN, Step
-from pipeline.project import Options, Project
+from pipeline.project import Options, Project, package_of, template_of
 from pipeline.reasons import brief
 from pipeline.runs import list_runs
 from pipeline.settings import ExecutionSection
@@ -28,7 +28,9 @@ def init_command(args: argparse.Namespace, options: Options) -> int:
     """Make a workspace."""
     root = args.directory or options.workspace
     existed = (root / "FORMAT").is_file()
-    workspace = Workspace.open(root, create=True)
+    workspace = Workspace.open(root, create=True, template=template_of(options))
+    memory = workspace.remembered()
+    workspace.remember({**memory, "definition": package_of(options, memory)})
     word = "is a workspace already" if existed else "made"
     sys.stdout.write(f"{workspace.root} {word}; next: banmo run VIDEOS --workspace {root}\n")
     return ExitCode.DONE

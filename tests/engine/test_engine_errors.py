@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.engine.laboratory import Lab
+from tests.engine.laboratory import Lab, wait_for
 
 SUGGESTIONS = {
     "--words.cuont 3": "did you mean count?",
@@ -56,7 +56,7 @@ FILES = {
 
 @pytest.mark.parametrize("text", FILES)
 def test_mistakes_in_pipeline_toml_get_a_suggestion(lab: Lab, text: str) -> None:
-    lab.command("init")
+    lab.command("init", "--definition", str(lab.package))
     (lab.workspace / "pipeline.toml").write_bytes(text.encode("latin-1"))
     outcome = lab.run()
     assert outcome.code == 2
@@ -71,7 +71,7 @@ def test_unknown_verbs_and_missing_workspaces(lab: Lab) -> None:
         assert outcome.code == 2 and "no workspace here" in outcome.err
     assert lab.command("run").code == 2
     assert not lab.workspace.exists(), "a mistake makes no workspace"
-    lab.command("init")
+    lab.command("init", "--definition", str(lab.package))
     assert "no videos named" in lab.command("run").err
     assert lab.command("inspect", "words").code == 2
 
@@ -149,8 +149,7 @@ def test_the_disk_is_asked_before_the_start(lab: Lab) -> None:
 
 def test_code_that_changes_under_way_is_not_filed_under_the_old_key(lab: Lab) -> None:
     child = lab.spawn("--words.delay_s", "0.4", "--until", "upper", "--video", "cat")
-    while not list(lab.workspace.glob("runs/*/logs/words-cat.txt")):
-        pass
+    wait_for(lambda: list(lab.workspace.glob("runs/*/logs/words-cat.txt")))
     lab.edit("shouting.py", "upper()", "lower()")
     out, err = child.communicate(timeout=60)
     assert child.returncode == 1, out

@@ -98,7 +98,7 @@ def test_dry_run_and_check(lab: Lab) -> None:
 
 
 def test_settings_layers_and_presets(lab: Lab) -> None:
-    lab.command("init")
+    lab.command("init", "--definition", str(lab.package))
     (lab.workspace / "pipeline.toml").write_text('[words]\ncount = 2\n[upper]\nmark = "."\n')
     lab.run("--preset", "large", "--upper.mark", "~")
     texts = sorted((lab.workspace / "latest/videos/cat/upper/inner").iterdir())
@@ -191,3 +191,16 @@ def test_workspace_may_lie_anywhere_and_paths_do_not_count(lab: Lab, tmp_path: P
     assert main(arguments) == 0
     assert "everything is up to date" in lab.capture().out
     assert {p.stem for p in (other / "actions").glob("*/*.json")} == keys
+
+
+def test_a_workspace_is_made_from_the_template_beside_the_pipeline(lab: Lab) -> None:
+    template = lab.root / "workspace_template"
+    template.mkdir()
+    (template / "pipeline.toml").write_text("[words]\ncount = 2\n")
+    (template / "README.md").write_text("read me")
+    assert lab.run("--until", "words").code == 0
+    assert (lab.workspace / "README.md").read_text() == "read me"
+    assert lab.records()["words/cat"].files == 2
+    (lab.workspace / "README.md").write_text("mine")
+    lab.command("init", "--definition", str(lab.package))
+    assert (lab.workspace / "README.md").read_text() == "mine"

@@ -7,22 +7,13 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 
-from tests.engine.laboratory import Lab
+from tests.engine.laboratory import Lab, wait_for
 
 SLOW = ("--merge.steps", "12", "--merge.delay_s", "0.25")
-
-
-def wait_for(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
-    """Wait until something is true; the machine may be ten times slower than usual."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it never happened"
-        time.sleep(0.02)
 
 
 def steps_done(lab: Lab) -> int:
