@@ -1,7 +1,8 @@
 """flow: where each pixel of the object goes, forward and backward, at several distances in time.
 
 Who answers, first to last: `clip.flow/` beside the video (the same layout: `fw-01/00000.png` ... in KITTI's format, or
-`.npy`), the ONNX network that the settings name, DIS (OpenCV), long steps started from chained short ones.
+`.npy`), the ONNX network that the settings name, DIS (OpenCV) on the object alone, long steps started from chained
+short ones.
 """
 
 from __future__ import annotations
@@ -28,7 +29,17 @@ from stages.formats import (
     write_json,
 )
 from stages.networks import NO_FILE, FlowNetwork
-from stages.perception.optical_flow import FlowPair, chained_pairs, direct_pairs, new_matcher, round_trip_error
+from stages.perception.optical_flow import (
+    PRESETS,
+    Chain,
+    FlowPair,
+    Matcher,
+    direct_pairs,
+    isolate,
+    place,
+    round_trip_error,
+    shared_window,
+)
 from stages.perception.sheets import flow_colours, pick, tile
 
 
@@ -39,7 +50,7 @@ class FlowSettings:
     steps: tuple[int, ...] = FLOW_STEPS
     """Distances in kept frames between which flow is computed."""
     quality: str = "medium"
-    """Preset of DIS: ultrafast, fast or medium."""
+    """Preset of DIS: ultrafast, fast, medium or fine; the smallest step always gets "fine" with medium."""
     dilate: float = 0.02
     """Flow is kept this far outside the mask, as a fraction of the longer side."""
     network: InputFile = NO_FILE
@@ -53,7 +64,8 @@ def flow(frames: Folder, masks: Folder, given: Given, settings: FlowSettings, ou
     """Flow with forward-backward confidence, KITTI's 16-bit PNG; `flow.json` with consistency figures a step."""
     cv2.setNumThreads(1)  # DIS gives other digits with other thread counts
     clip = read_clip(frames.path)
-    near = _near_object(read_masks(masks.path, clip), settings.dilate)
+    probability = read_masks(masks.path, clip)
+    near = _near_object(probability, settings.dilate)
     steps = _steps(settings, clip)
     folder = given.get(".flow")
     figures: dict[int, list[tuple[float, float]]] = {}
@@ -61,7 +73,7 @@ def flow(frames: Folder, masks: Folder, given: Given, settings: FlowSettings, ou
         provider = "given"
         _copy_given(folder, clip, near, out, figures, run)
     else:
-        provider, pairs = _provider(clip, settings, steps, run)
+        provider, pairs = _provider(clip, probability, settings, steps, run)
         for done, pair in enumerate(pairs):
             _write_pair(pair, clip, near, out, figures)
             run.tick(done + 1, sum(len(clip) - s for s in steps), label="flow")
@@ -86,8 +98,8 @@ def flow(frames: Folder, masks: Folder, given: Given, settings: FlowSettings, ou
 def _steps(settings: FlowSettings, clip: Clip) -> tuple[int, ...]:
     if not settings.steps or min(settings.steps) < 1:
         raise BadInput("flow.steps must be distances of one frame or more")
-    if settings.quality not in ("ultrafast", "fast", "medium"):
-        raise BadInput(f"flow.quality is {settings.quality!r}, it must be ultrafast, fast or medium")
+    if settings.quality not in PRESETS:
+        raise BadInput(f"flow.quality is {settings.quality!r}, it must be one of {', '.join(PRESETS)}")
     steps = tuple(sorted({s for s in settings.steps if s < len(clip)}))
     return steps or (1,)
 
@@ -99,14 +111,21 @@ def _near_object(masks: np.ndarray, dilate: float) -> np.ndarray:
     return np.stack([cv2.dilate(m, disc) > 127 for m in masks])
 
 
-def _provider(clip: Clip, settings: FlowSettings, steps: tuple[int, ...], run: Run) -> tuple[str, Iterator[FlowPair]]:
+def _provider(
+    clip: Clip, masks: np.ndarray, settings: FlowSettings, steps: tuple[int, ...], run: Run
+) -> tuple[str, Iterator[FlowPair]]:
     if settings.network:
         network = FlowNetwork(Path(settings.network), settings.network_contract, device=run.device, threads=run.threads)
         run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
         images = clip.images()
         return network.path.name, direct_pairs(images, steps, network)
-    grey = np.stack([cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY) for i in range(len(clip))])
-    return f"dis-{settings.quality}", chained_pairs(grey, steps, new_matcher(settings.quality))
+    rows, columns = shared_window(masks > 127)
+    on = masks[:, rows, columns] > 127
+    grey = [cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY)[rows, columns] for i in range(len(clip))]
+    frames = np.stack([isolate(g, m) for g, m in zip(grey, on, strict=True)])
+    matcher = Matcher(settings.quality)
+    chain = Chain(frames, on, matcher, Matcher("fine") if settings.quality == "medium" else matcher)
+    return f"dis-{settings.quality}", (place(pair, rows, columns, masks.shape[1:]) for pair in chain.pairs(steps))
 
 
 def _write_pair(

@@ -32,7 +32,7 @@ from stages.formats import (
 )
 from stages.networks import NO_FILE, MaskNetwork
 from stages.perception.background import shrink
-from stages.perception.optical_flow import new_matcher, sample
+from stages.perception.optical_flow import Matcher, sample
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
 from stages.perception.temporal import describe
@@ -239,13 +239,13 @@ def _facts(provider: str, result: Segmentation, clip: Clip, threshold: float) ->
 
 def _carried(binary: np.ndarray, clip: Clip, side_px: int = 160) -> list[np.ndarray | None]:
     """The mask before, brought to each frame by flow, at the masks' own size; None for the first frame."""
-    matcher = new_matcher("fast")
+    matcher = Matcher("fast")
     out: list[np.ndarray | None] = [None]
     before = None
     for t in range(len(clip)):
         grey = cv2.cvtColor(shrink(clip.image(t), side_px), cv2.COLOR_RGB2GRAY)
         if before is not None:
-            flow = matcher.calc(grey, before, None)
+            flow = matcher(grey, before)
             small = cv2.resize(binary[t - 1].astype(np.float32), grey.shape[::-1], interpolation=cv2.INTER_AREA)
             moved = sample(small, flow)
             out.append(cv2.resize(moved, (clip.width, clip.height), interpolation=cv2.INTER_LINEAR) > 0.5)

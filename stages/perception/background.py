@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.perception.optical_flow import new_matcher, pixel_grid, sample
+from stages.perception.optical_flow import Matcher, pixel_grid, sample
 
 STEPS = (1, 3, 6)
 """Frames before and after that each frame is compared with."""
@@ -116,7 +116,7 @@ def motion_cues(
     lab = [cv2.GaussianBlur(to_lab(image), (0, 0), 0.6) for image in images]
     basis, grid = polynomial_basis(height, width), pixel_grid(height, width)
     trust = np.where(border_distance(height, width) > 0.55, 1.0, 0.25).astype(np.float32)
-    matcher = new_matcher("medium")
+    matcher = Matcher("medium")
     moving = np.zeros((count, height, width), np.float32)
     evidence = np.zeros((count, height, width), np.float32)
     for t in range(count):
@@ -125,7 +125,7 @@ def motion_cues(
             sides = []
             for other in (t - step, t + step):
                 if 0 <= other < count:
-                    flow = matcher.calc(grey[t], grey[other], None)
+                    flow = matcher(grey[t], grey[other])
                     vote, proof = _compare(lab[t], lab[other], flow, trust, basis, grid)
                     votes.append(vote)
                     sides.append(proof)

@@ -19,7 +19,7 @@ import numpy as np
 
 from stages.perception.appearance import ClipNetwork, PixelColours, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
-from stages.perception.optical_flow import new_matcher, sample
+from stages.perception.optical_flow import Matcher, sample
 from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
@@ -59,11 +59,11 @@ class Carrier:
 
     def __init__(self, work: list[np.ndarray]) -> None:
         grey = [cv2.cvtColor(shrink(image, CARRY_SIDE_PX), cv2.COLOR_RGB2GRAY) for image in work]
-        matcher = new_matcher("fast")
+        matcher = Matcher("fast")
         self.size = grey[0].shape[::-1]
         pairs = list(pairwise(grey))
-        self.to_next = [matcher.calc(a, b, None) for a, b in pairs]  # frame t -> t+1
-        self.to_previous = [matcher.calc(b, a, None) for a, b in pairs]  # frame t+1 -> t
+        self.to_next = [matcher(a, b) for a, b in pairs]  # frame t -> t+1
+        self.to_previous = [matcher(b, a) for a, b in pairs]  # frame t+1 -> t
 
     def spread(self, maps: np.ndarray, decay: float, strongest: bool = True) -> np.ndarray:
         """(T, h, w) maps, each joined with its neighbours' carried here, weaker by `decay` a frame.

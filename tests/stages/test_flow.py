@@ -11,7 +11,18 @@ import pytest
 from pipeline import BadInput, Given, Run
 from stages.flow import FlowSettings, _check, _sheet, flow
 from stages.formats import flow_path, read_clip, read_flow, read_json
-from stages.perception.optical_flow import chained_pairs, compose, confidence, new_matcher, pixel_grid, sample
+from stages.perception.optical_flow import (
+    Chain,
+    Matcher,
+    compose,
+    confidence,
+    isolate,
+    make_pair,
+    pixel_grid,
+    place,
+    sample,
+    shared_window,
+)
 from stages.perception.temporal import enlarge
 from tests.stages.perception_clips import moving_clip, texture, write_frames_folder, write_masks_folder
 
@@ -86,10 +97,11 @@ def test_chains_reach_farther_than_direct_matching() -> None:
     rng = np.random.default_rng(1)
     wide = cv2.cvtColor(texture(rng, 96, 500, (0, 0, 0), (255, 255, 255)), cv2.COLOR_RGB2GRAY)
     grey = np.stack([wide[:, 9 * t : 9 * t + 128] for t in range(9)])
-    pairs = [p for p in chained_pairs(grey, (1, 2, 4, 8), new_matcher()) if p.step == 8]
+    chain = Chain(grey, np.ones(grey.shape, bool), Matcher(), Matcher("fine"))
+    pairs = [p for p in chain.pairs((1, 2, 4, 8)) if p.step == 8]
     stays = pixel_grid(96, 128)[..., 0] > 80  # what is still in sight 72 px further left
     error = np.linalg.norm(pairs[0].forward - np.float32([-72, 0]), axis=-1)[stays]
-    direct = new_matcher().calc(grey[0], grey[8], None)
+    direct = Matcher()(grey[0], grey[8])
     assert np.median(error) < 1.0
     assert np.median(error) < np.median(np.linalg.norm(direct - np.float32([-72, 0]), axis=-1)[stays])
 
@@ -101,3 +113,31 @@ def test_enlarged_flow_keeps_its_meaning() -> None:
     np.testing.assert_allclose(large[5, 5], [4.0, 2.0])
     ramp = np.tile(np.arange(40, dtype=np.float32), (16, 1))
     np.testing.assert_allclose(sample(ramp, large)[8, 10], 14.0, atol=0.05)
+
+
+def test_isolating_the_object_frees_thin_limbs_from_the_background() -> None:
+    rng = np.random.default_rng(4)
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in IMAGES[:2]]
+    arm = TRUTH[0].copy()
+    arm[: int(TRUTH[0].shape[0] * 0.66)] = False
+    error = {}
+    for name, frames in (("plain", grey), ("alone", [isolate(g, m) for g, m in zip(grey, TRUTH[:2], strict=True)])):
+        found = Matcher("fine")(frames[0], frames[1])
+        error[name] = np.linalg.norm(found - SPEED, axis=-1)[arm].mean()
+    assert error["alone"] < 0.7 * error["plain"]
+    alone = isolate(grey[0], TRUTH[0])
+    assert np.abs(alone.astype(int) - grey[0])[cv2.erode(TRUTH[0].astype(np.uint8), np.ones((5, 5))) > 0].max() <= 2
+    assert alone[~TRUTH[0]].std() < grey[0][~TRUTH[0]].std()
+    noise = rng.integers(0, 255, (32, 32)).astype(np.uint8)
+    np.testing.assert_array_equal(isolate(noise, np.zeros((32, 32), bool)), noise)
+
+
+def test_window_and_placing() -> None:
+    masks = np.zeros((3, 200, 300), bool)
+    masks[0, 80:90, 100:120] = masks[2, 100:140, 150:160] = True
+    rows, columns = shared_window(masks)
+    assert (rows.start, rows.stop, columns.start, columns.stop) == (54, 166, 74, 186)
+    small = np.ones((112, 112, 2), np.float32)
+    pair = place(make_pair(1, 0, small, -small, pixel_grid(112, 112)), rows, columns, (200, 300))
+    assert pair.forward.shape == (200, 300, 2) and pair.forward[60, 80, 0] == 1 and not pair.forward[:50].any()
+    assert pair.forward_confidence[100, 100] > 0.9 and pair.forward_confidence[10, 10] == 0
