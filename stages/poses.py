@@ -23,6 +23,7 @@ from stages.registration.placing import (
     transforms,
 )
 from stages.registration.search import search
+from stages.registration.sheets import draw_pose, pose_sheet
 from stages.registration.upright import upright
 
 CROP_PX = 48
@@ -81,7 +82,7 @@ def poses(
 
 
 def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
-    """The user's own poses of one clip, checked, at its kept frames; pixels of the source scaled to those of the frames.
+    """The user's own poses of one clip, checked, at its kept frames, in pixels of those frames.
 
     Raises:
         BadInput: unreadable, or not what it should be.
@@ -168,10 +169,10 @@ def _ask(
 def _track(subject: Subject, answer: Answer) -> formats.PoseTrack:
     """From the crop's rotations to root poses: translation from the mask's box, depth smooth in time."""
     cues = subject.cues
-    rotation = ray_rotation(cues.centre_px, subject.intrinsics) @ answer.rotation
+    rotation = ray_rotation(answer.origin_px, subject.intrinsics) @ answer.rotation
     depth = depth_from_size(cues.box_px, subject.intrinsics, answer.extent)
     depth = np.exp(smooth(np.log(depth), 3.0))
-    translation = place(cues.box_px, depth, subject.intrinsics)
+    translation = place(answer.origin_px, depth, subject.intrinsics)
     confidence = np.where(cues.known, answer.confidence, 0.0)
     return formats.PoseTrack(
         subject.intrinsics, transforms(rotation, translation), confidence, [answer.provider] * len(cues)
@@ -226,3 +227,17 @@ def _check(out: Path, frames: dict[str, Folder]) -> None:
             raise formats.FormatError(f"{name}.json: {len(track.object_to_camera)} poses for {len(clip)} frames")
         if (track.object_to_camera[:, 2, 3] <= 0).any():
             raise formats.FormatError(f"{name}.json: an object behind the camera")
+
+
+@poses.sheet
+def _sheet(out: Path, frames: dict[str, Folder], picture: Path) -> None:
+    """Each clip's frames with the object's axes and horizon drawn in the estimated pose."""
+    rows = []
+    verdict = formats.read_json(out / "poses.json")["videos"]
+    for name, folder in frames.items():
+        clip, track = formats.read_clip(folder.path), formats.read_poses(out / f"{name}.json")
+        pick = np.unique(np.round(np.linspace(0, len(clip) - 1, min(9, len(clip)))).astype(int))
+        drawn = [draw_pose(clip.image(i), track.intrinsics, track.object_to_camera[i]) for i in pick]
+        title = f"{name}: {verdict[name]['provider']}, trust {100 * verdict[name]['trust']:.0f} %"
+        rows.append((title, drawn, track.confidence[pick]))
+    formats.write_image(picture, pose_sheet(rows))

@@ -25,7 +25,7 @@ class Subject:
 class Answer:
     """Rotations of one clip, and how far to trust them.
 
-    `rotation` (T, 3, 3) takes object space to the camera turned onto the crop's centre
+    `rotation` (T, 3, 3) takes object space to the camera turned onto the object's origin
     (:func:`placing.ray_rotation` gives the real camera's); `extent` (T,) is the object's size in the picture, units:
     the longer side of the mask's box, from which depth follows.
     """
@@ -33,6 +33,7 @@ class Answer:
     provider: str
     rotation: np.ndarray
     extent: np.ndarray
+    origin_px: np.ndarray  # (T, 2) where the object's origin appears in the full image
     confidence: np.ndarray  # (T,) in 0..1
     trust: float  # 0..1: how likely the clip as a whole is right within 45 degrees or so
     score: dict[str, Any] = field(default_factory=dict)  # figures for poses.json

@@ -10,7 +10,7 @@ import torch
 from torch.nn.functional import grid_sample, interpolate
 
 from stages.registration.placing import smooth
-from stages.registration.tracking import azimuth_steps, elevation_step, forward_backward
+from stages.registration.tracking import azimuth_steps, elevation_step, forward_backward, posterior_angles
 from stages.registration.volume import EXTENT, ViewBank, pixel_axis, pixel_grid
 from stages.registration.windows import Windows, difference, like_views
 
@@ -140,26 +140,14 @@ class Hypothesis:
         occupancy = self.occupancy()
         picture = self.bank.render(occupancy, self.colour)
         views, view_size, centre = like_views(picture)
-        elevation = self.bank.elevation
-        start = np.exp(-0.5 * ((elevation - self.weights.elevation_mean) / self.weights.elevation_sigma) ** 2)
-        start = np.tile(start / start.sum() / len(self.bank.azimuth), (len(self.bank.azimuth), 1))
         found, first, evidence, frames = [], [], 0.0, 0
         clips = list(range(len(self.sequences))) if clips is None else clips
         for k in clips:
             s = self.sequences[k]
-            if s.like is None:
-                s.like = s.windows.like()
-            cost = difference(s.like, views, self.weights.colour)
-            units = torch.log(view_size[None] / s.windows.area.sqrt()[:, None].clamp(min=1e-3))
-            cost = cost + self.weights.size * (units - torch.log(self.units[k])[:, None]).abs().clamp(max=0.5)
-            cost = cost * s.windows.weight[:, None]
+            cost, units = self._compare(k, views, view_size)
             if s.fixed is None:
-                likelihood = (-sharpness * cost).numpy().astype(np.float64).reshape(-1, *self.bank.shape)
-                steps = azimuth_steps(self.bank.azimuth, s.drift, s.step_sigma)
-                self.posterior[k], log_evidence = forward_backward(
-                    likelihood, start, steps, elevation_step(elevation, np.radians(5.0))
-                )
-                evidence -= log_evidence / sharpness
+                self.posterior[k], loss = self._track(k, cost, sharpness)
+                evidence += loss
                 frames += len(cost)
             else:
                 self.posterior[k] = s.fixed
@@ -178,3 +166,40 @@ class Hypothesis:
         middle = torch.stack([(occupancy.sum(other) * axis).sum() for other in ((0, 1), (0, 2), (1, 2))]) / total
         # keep the volume's own centroid at the origin
         self.offset = centre - torch.einsum("pij,j->pi", self.bank.rotation, middle)[:, :2] / EXTENT
+
+    def _compare(self, k: int, views: torch.Tensor, view_size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Cost of every view for every frame of a clip (T, P), and the log scale it would mean (T, P)."""
+        s = self.sequences[k]
+        if s.like is None:
+            s.like = s.windows.like()
+        cost = difference(s.like, views, self.weights.colour)
+        units = torch.log(view_size[None] / s.windows.area.sqrt()[:, None].clamp(min=1e-3))
+        cost = cost + self.weights.size * (units - torch.log(self.units[k])[:, None]).abs().clamp(max=0.5)
+        return cost * s.windows.weight[:, None], units
+
+    def _track(self, k: int, cost: torch.Tensor, sharpness: float) -> tuple[np.ndarray, float]:
+        """Posterior (T, A, E) of a clip's frames and its evidence as a cost, summed over frames."""
+        s, elevation = self.sequences[k], self.bank.elevation
+        start = np.exp(-0.5 * ((elevation - self.weights.elevation_mean) / self.weights.elevation_sigma) ** 2)
+        start = np.tile(start / start.sum() / len(self.bank.azimuth), (len(self.bank.azimuth), 1))
+        likelihood = (-sharpness * cost).numpy().astype(np.float64).reshape(-1, *self.bank.shape)
+        steps = azimuth_steps(self.bank.azimuth, s.drift, s.step_sigma)
+        posterior, log_evidence = forward_backward(likelihood, start, steps, elevation_step(elevation, np.radians(5.0)))
+        return posterior, -log_evidence / sharpness
+
+    @torch.no_grad()
+    def margin(self, k: int, sharpness: float, apart: float = np.radians(60.0)) -> float:
+        """How much worse a frame of clip `k` is explained when it must be seen from elsewhere.
+
+        The clip is tracked again with all views within `apart` of the found azimuths forbidden; the answer is the
+        rise of its evidence, as a cost a frame. Near zero: the found poses are no better than quite different ones.
+        """
+        picture = self.bank.render(self.occupancy(), self.colour)
+        views, view_size, _ = like_views(picture)
+        cost, _ = self._compare(k, views, view_size)
+        _, here = self._track(k, cost, sharpness)
+        azimuth, _, _ = posterior_angles(self.posterior[k], self.bank.azimuth, self.bank.elevation)
+        turn = np.abs(np.angle(np.exp(1j * (azimuth[:, None] - self.bank.azimuth[None]))))
+        forbidden = torch.as_tensor(np.repeat(turn < apart, len(self.bank.elevation), axis=1))
+        _, elsewhere = self._track(k, torch.where(forbidden, cost + 10.0, cost), sharpness)
+        return (elsewhere - here) / len(cost)

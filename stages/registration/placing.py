@@ -74,7 +74,7 @@ def smooth(values: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian smoothing along the first axis, in frames; straight lines stay straight up to the ends."""
     if sigma <= 0 or len(values) < 3:
         return values.copy()
-    pad = min(len(values) - 1, max(1, round(3 * sigma)))
+    pad = min(len(values) - 1, round(4 * sigma) + 1)
     before = 2 * values[:1] - values[pad:0:-1]
     after = 2 * values[-1:] - values[-2 : -pad - 2 : -1]
     padded = np.concatenate([before, values, after])
@@ -99,10 +99,9 @@ def mask_boxes(masks: np.ndarray, threshold: int = 128) -> tuple[np.ndarray, np.
     return fill_gaps(boxes, known), known
 
 
-def place(boxes: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Translations (T, 3) that put the object's origin at `depth` (T,) on the ray through each box's centre."""
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    ray = np.concatenate([centre, np.ones((len(centre), 1))], 1) @ np.linalg.inv(intrinsics).T
+def place(origin_px: np.ndarray, depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Translations (T, 3) that put the object's origin at `depth` (T,) on the rays through (T, 2) pixels."""
+    ray = np.concatenate([origin_px, np.ones((len(origin_px), 1))], 1) @ np.linalg.inv(intrinsics).T
     return ray * depth[:, None]
 
 

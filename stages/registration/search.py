@@ -1,4 +1,4 @@
-"""Root poses of any object, without a network: many hypotheses, each a volume and its poses; the best explain the frames.
+"""Root poses of any object without a network: many hypotheses, each a volume and its poses.
 
 From random starts, expectation maximisation between a small coloured volume and the frames' views (as single-particle
 microscopy reconstructs molecules from unknown projections), tied in time and led by the flow; the better half goes
@@ -17,7 +17,7 @@ from stages.registration.model import Hypothesis, Sequence, Weights
 from stages.registration.placing import smooth, view_angles, view_rotation
 from stages.registration.tracking import posterior_angles
 from stages.registration.turning import expected_turns
-from stages.registration.volume import ViewBank
+from stages.registration.volume import EXTENT, ViewBank
 from stages.registration.windows import Windows, whiten_together
 
 
@@ -37,8 +37,11 @@ class Effort:
 COARSE_ELEVATION = np.radians([18.0])
 FINE_ELEVATION = np.radians([8.0, 18.0, 28.0])
 AZIMUTHS = 36
-MARGIN = 0.004
+LAST_SHARPNESS = 30.0
+RIVAL_MARGIN = 0.004
 """Difference of evidence (cost a frame) at which two hypotheses are told apart with some confidence."""
+TELLING_MARGIN = 0.09
+"""Rise of a clip's evidence, seen from elsewhere, at which its own poses are well supported; see Hypothesis.margin."""
 
 
 def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effort()) -> dict[str, Answer]:
@@ -47,17 +50,19 @@ def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effo
     drifts = [expected_turns(s.cues) for s in subjects]
     bank = ViewBank(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, COARSE_ELEVATION, effort.coarse_px)
     sequences = make_sequences(subjects, chosen, drifts, bank)
-    total = effort.starts * 6 + max(2, effort.starts // 3) * effort.rounds + 3 * effort.fine_rounds
+    kept_count = max(2, effort.starts // 3)
+    total = effort.starts * 6 + kept_count * (effort.rounds - 6) + len(subjects) + 10 + effort.fine_rounds
     clock = _Clock(tell, total)
     starts = [Hypothesis(sequences, bank, effort.coarse_px, Weights(), seed * 1000 + i) for i in range(effort.starts)]
     for i, hypothesis in enumerate(starts):
         scatter(hypothesis, np.random.default_rng([seed, i]))
         anneal(hypothesis, 8.0, 12.0, 6, clock)
-    kept = sorted(starts, key=lambda h: h.evidence)[: max(2, effort.starts // 3)]
+    kept = sorted(starts, key=lambda h: h.evidence)[:kept_count]
     for hypothesis in kept:
-        anneal(hypothesis, 12.0, 30.0, effort.rounds - 6, clock)
+        anneal(hypothesis, 12.0, LAST_SHARPNESS, effort.rounds - 6, clock)
     kept.sort(key=lambda h: h.evidence)
-    rivals = sorted(kept + [reregister(h, clock) for h in kept[:2]], key=lambda h: h.evidence)
+    rivals = [*kept, reregister(kept[0], clock), mirrored(kept[0], clock)]
+    rivals.sort(key=lambda h: h.evidence)
     best = finer(rivals[0], subjects, chosen, drifts, effort, clock)
     return {s.name: _answer(s, k, best, rivals, chosen[k]) for k, s in enumerate(subjects) if s.rotation is None}
 
@@ -128,21 +133,29 @@ def anneal(hypothesis: Hypothesis, first: float, last: float, rounds: int, clock
 
 def reregister(hypothesis: Hypothesis, clock: _Clock) -> Hypothesis:
     """Each clip in turn looked up anew in a volume made without it; then all together."""
-    best = hypothesis
-    clips = range(len(hypothesis.sequences))
-    if len(hypothesis.sequences) < 2:
-        return hypothesis.copy()
-    trial = best.copy()
+    trial = hypothesis.copy()
+    clips = range(len(trial.sequences))
     for k in clips:
-        if trial.sequences[k].fixed is not None:
-            continue
-        without = trial.copy()
-        without.improve(8, [j for j in clips if j != k])
-        without.look(15.0, [k])
-        trial.posterior[k] = without.posterior[k]
+        if trial.sequences[k].fixed is None and len(clips) > 1:
+            without = trial.copy()
+            without.improve(8, [j for j in clips if j != k])
+            without.look(15.0, [k])
+            trial.posterior[k] = without.posterior[k]
         clock.tick()
-    anneal(trial, 20.0, 30.0, 4, clock)
+    anneal(trial, 20.0, LAST_SHARPNESS, 4, clock)
     return trial
+
+
+def mirrored(hypothesis: Hypothesis, clock: _Clock) -> Hypothesis:
+    """The same clips turning the other way: outlines alone cannot tell the two apart, surfaces and flow can."""
+    other = Hypothesis(
+        hypothesis.sequences, hypothesis.bank, hypothesis.voxels, hypothesis.weights, hypothesis.random.initial_seed()
+    )
+    for k, s in enumerate(other.sequences):
+        backwards = np.roll(hypothesis.posterior[k][:, ::-1], 1, axis=1)  # azimuth a becomes -a
+        other.posterior[k] = backwards if s.fixed is None else s.fixed
+    anneal(other, 15.0, LAST_SHARPNESS, 6, clock)
+    return other
 
 
 def finer(
@@ -161,7 +174,7 @@ def finer(
     for k, s in enumerate(sequences):
         azimuth, elevation, _ = posterior_angles(hypothesis.posterior[k], bank.azimuth, hypothesis.bank.elevation)
         fine.posterior[k] = spread(bank, azimuth, elevation) if s.fixed is None else s.fixed
-    anneal(fine, 20.0, 30.0, effort.fine_rounds, clock)
+    anneal(fine, 20.0, LAST_SHARPNESS, effort.fine_rounds, clock)
     return fine
 
 
@@ -171,10 +184,24 @@ def _answer(subject: Subject, k: int, best: Hypothesis, rivals: list[Hypothesis]
     azimuth = smooth(np.interp(every, chosen, np.unwrap(azimuth)), 2.0)
     elevation = smooth(np.interp(every, chosen, elevation), 3.0)
     units = np.interp(every, chosen, best.units[k].numpy())
-    trust = agreement(best, rivals, k)
+    share = best.posterior[k].reshape(len(chosen), -1)
+    shift = (share @ best.offset.numpy()) * EXTENT / best.units[k].numpy()[:, None]  # of the centroid, half crops
+    offset = np.stack([np.interp(every, chosen, s) for s in (best.sequences[k].windows.centre.numpy() - shift).T], 1)
+    origin = subject.cues.centre_px + smooth(offset, 2.0) * subject.cues.half_px[:, None]
+    margin = best.margin(k, LAST_SHARPNESS)
+    agreed = agreement(best, rivals, k)
+    trust = 0.95 * agreed * (1 - np.exp(-max(margin, 0.0) / TELLING_MARGIN))
     confidence = trust * np.interp(every, chosen, sharp) * np.where(subject.cues.cut, 0.5, 1.0)
-    figures = {"cost": round(best.cost[k], 4), "evidence": round(best.evidence, 4)}
-    return Answer("search", view_rotation(azimuth, elevation), 2 * units / CROP_MARGIN, confidence, trust, figures)
+    figures = {"cost": round(best.cost[k], 4), "margin": round(margin, 4), "agreement": round(agreed, 4)}
+    return Answer(
+        "search",
+        view_rotation(azimuth, elevation),
+        2 * units / CROP_MARGIN,
+        origin,
+        confidence,
+        float(trust),
+        figures,
+    )
 
 
 def agreement(best: Hypothesis, rivals: list[Hypothesis], k: int) -> float:
@@ -184,7 +211,7 @@ def agreement(best: Hypothesis, rivals: list[Hypothesis], k: int) -> float:
         return np.exp(1j * posterior_angles(h.posterior[j], h.bank.azimuth, h.bank.elevation)[0])
 
     clips = range(len(best.sequences))
-    say = np.array([np.exp(-(h.evidence - rivals[0].evidence) / MARGIN) for h in rivals])
+    say = np.array([np.exp(-(h.evidence - rivals[0].evidence) / RIVAL_MARGIN) for h in rivals])
     agrees = []
     for h in rivals:
         own = bearings(best, k) / bearings(h, k)

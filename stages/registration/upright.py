@@ -23,5 +23,5 @@ def upright(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]
         azimuth = np.concatenate([[0.0], np.cumsum(expected_turns(cues)[:-1])])
         rotation = view_rotation(azimuth, np.full(len(cues), ELEVATION))
         extent = np.full(len(cues), OBJECT_SIZE)
-        answers[subject.name] = Answer("upright", rotation, extent, 0.1 * cues.known, 0.05)
+        answers[subject.name] = Answer("upright", rotation, extent, cues.centre_px, 0.1 * cues.known, 0.05)
     return answers

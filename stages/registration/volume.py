@@ -53,7 +53,7 @@ class ViewBank:
         return len(self.rotation)
 
     def render(self, occupancy: torch.Tensor, colour: torch.Tensor, rotation: torch.Tensor | None = None) -> Picture:
-        """Pictures of occupancy (N, N, N) in 0..1 and colour (C, N, N, N), from these rotations (all views of the bank).
+        """Pictures of occupancy (N, N, N) in 0..1 and colour (C, N, N, N) from (P, 3, 3) rotations (all views).
 
         Light is absorbed along the ray; each step's share is ``T (1 - exp(-k o))``.
         """
