@@ -100,7 +100,7 @@ def progress_text(event: dict[str, Any]) -> str:
     """``143/212  loss 0.31``."""
     total = event.get("total")
     done = event.get("done", 0)
-    text = f"{done:g}/{total:g}" if isinstance(total, int | float) else f"{done:g}"
+    text = f"{done:g}/{total:g}" if isinstance(total, int | float) and total > 0 else f"{done:g}"
     if event.get("label"):
         text = f"{event['label']} {text}"
     extra = event.get("extra") or {}

@@ -25,7 +25,7 @@ def export(project: Project, planner: Planner, to: Path | None = None) -> Path |
     records = {n.video_name: planner.results[n.label] for n in nodes if n.label in planner.results}
     if len(records) < len(nodes):
         return None
-    target = to or project.workspace.exports
+    target = (to or project.workspace.exports).resolve()  # a link to another disk stays a link
     if _is_there(target, records):
         return target
     with project.workspace.exclusive():

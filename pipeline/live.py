@@ -50,6 +50,8 @@ class Progress:
         done, total = self.event.get("done"), self.event.get("total")
         if self.first is None or not isinstance(done, int | float) or not isinstance(total, int | float):
             return None
+        if total <= 0 or done > total:
+            return None
         elapsed, gained = time.monotonic() - self.first[0], done - self.first[1]
         return elapsed * (total - done) / gained if gained > 0 and elapsed > 1.0 else None
 
@@ -89,8 +91,9 @@ class LiveDisplay:
             self._running[label] = Progress(time.monotonic())
         elif kind == "progress" and label in self._running:
             progress = self._running[label]
+            another = [event.get(k) for k in ("label", "total")] != [progress.event.get(k) for k in ("label", "total")]
             progress.event = event
-            if progress.first is None or event.get("done", 0) < progress.first[1]:
+            if progress.first is None or another or event.get("done", 0) < progress.first[1]:
                 progress.first = (time.monotonic(), float(event.get("done", 0)))
         elif kind in ("waiting", "silent") and label in self._running:
             self._running[label].event = {"label": event.get("text", ""), "done": 0}

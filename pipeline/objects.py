@@ -108,7 +108,7 @@ class Objects:
         _make_read_only(scratch)
         os.sync()
         failpoint("after_sync")
-        if target.is_dir() and self.deep_check(kind, digest):
+        if os.path.lexists(target) and self.deep_check(kind, digest):
             self.set_aside(kind, digest)
         write_atomic(self.seal_path(kind, digest), manifest, durable=True)
         failpoint("after_seal")

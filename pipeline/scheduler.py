@@ -7,10 +7,10 @@ import secrets
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
+from pipeline.errors import BadInput
 from pipeline.files import remove_tree, write_json
 from pipeline.graph import Node
 from pipeline.guard import needs_decision
@@ -18,36 +18,10 @@ from pipeline.local import Job, Outcome, Tokens
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
 from pipeline.request import build_request
 from pipeline.runs import RunFolder
+from pipeline.tally import Display, Report
 
 _POLL_S = 0.05
 _SILENT_S = 600.0
-
-
-class Display(Protocol):
-    """What shows a run to people."""
-
-    def event(self, label: str, event: dict[str, Any]) -> None:
-        """Something happened to the node `label`: queued, hit, started, progress, warning, done, failed, …"""
-
-    def refresh(self) -> None:
-        """Time passed."""
-
-
-@dataclass
-class Report:
-    """How a run ended."""
-
-    done: list[str] = field(default_factory=list)
-    hits: list[str] = field(default_factory=list)
-    failed: dict[str, str] = field(default_factory=dict)
-    bad_input: dict[str, str] = field(default_factory=dict)
-    interrupted: list[str] = field(default_factory=list)
-    blocked: dict[str, str] = field(default_factory=dict)
-    not_started: list[str] = field(default_factory=list)
-    warnings: dict[str, list[str]] = field(default_factory=dict)
-    undecided: list[Step] = field(default_factory=list)
-    stopped_by: int | None = None
-    seconds: float = 0.0
 
 
 class Scheduler:
@@ -129,7 +103,11 @@ class Scheduler:
                 self._tell(node, {"event": "blocked", "text": blocker})
             elif not self._unknown_inputs(node):
                 self._waiting.remove(node)
-                step = self.planner.decide(node)
+                try:
+                    step = self.planner.decide(node)
+                except BadInput as error:
+                    self._refuse(node, error)
+                    continue
                 self._steps[node.label] = step
                 if step.status == HIT:
                     self._show_hit(step)
@@ -165,18 +143,35 @@ class Scheduler:
             granted = self.tokens.take(node.info.cpus, node.info.gpus)
             if granted is None:
                 continue
-            self._ready.remove(node)
             busy.add(self._key(node))
-            step = self._steps[node.label]
-            if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
-                self.workspace.objects.set_aside(node.info.name, step.record.digest)
-            cpus, gpus = granted
-            attempt = self.workspace.tmp / f"try-{self.folder.id}-{secrets.token_hex(4)}"
-            attempt.mkdir(parents=True)
-            request = build_request(self.planner, step, self.folder.id, cpus, gpus)
-            write_json(attempt / "request.json", request)
-            self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
-            self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
+            self._ready.remove(node)
+            try:
+                self._start(node, *granted)
+            except BadInput as error:
+                self.tokens.give_back(*granted)
+                self._refuse(node, error)
+
+    def _start(self, node: Node, cpus: int, gpus: list[str]) -> None:
+        """Start a worker; if what it reads has changed since the plan was made, decide the node anew instead."""
+        step = self._steps[node.label]
+        request = build_request(self.planner, step, self.folder.id, cpus, gpus)
+        if self.planner.action(node).key != self._key(node):
+            self.tokens.give_back(cpus, gpus)
+            self._waiting.append(node)
+            self._seen_results = (-1, -1)
+            return
+        if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
+            self.workspace.objects.set_aside(node.info.name, step.record.digest)
+        attempt = self.workspace.tmp / f"try-{self.folder.id}-{secrets.token_hex(4)}"
+        attempt.mkdir(parents=True)
+        write_json(attempt / "request.json", request)
+        self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
+        self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
+
+    def _refuse(self, node: Node, error: BadInput) -> None:
+        """What a node reads has become unreadable under way: it fails, the others go on."""
+        self.report.bad_input[node.label] = str(error)
+        self._tell(node, {"event": "bad_input", "text": str(error)})
 
     def _made_meanwhile(self, node: Node) -> bool:
         """Whether the result has appeared since the plan was made; then it is a hit."""

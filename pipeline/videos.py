@@ -214,7 +214,10 @@ def _listing(folder: Path) -> list[tuple[str, Path]]:
 
 
 def state_of(path: Path) -> list[Any]:
-    """What changes when a source changes; compared before and after a stage has read it."""
-    if path.is_dir():
-        return [[printable(name), *signature(p.stat())] for name, p in _listing(path)]
-    return signature(path.stat())
+    """What changes when a source changes; compared before and after a stage has read it. Empty when it is gone."""
+    try:
+        if path.is_dir():
+            return [[printable(name), *signature(p.stat())] for name, p in _listing(path)]
+        return signature(path.stat())
+    except OSError:
+        return []

@@ -218,11 +218,7 @@ class Worker:
     def _same_sources(self) -> None:
         for source in self.request["sources"]:
             for path, before in source["states"].items():
-                try:
-                    now = state_of(Path(path))
-                except OSError:
-                    now = []
-                if now != before:
+                if state_of(Path(path)) != before:
                     raise BadInput(
                         "it changed while it was being read", where=path, hint="run again when it is complete"
                     )

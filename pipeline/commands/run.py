@@ -22,8 +22,9 @@ from pipeline.plan import HIT, Planner, Step
 from pipeline.preflight import check_disk
 from pipeline.project import Options, Project
 from pipeline.runs import RunFolder, shows
-from pipeline.scheduler import Report, Scheduler
+from pipeline.scheduler import Scheduler
 from pipeline.settings import to_toml
+from pipeline.tally import Report
 from pipeline.videos import orphans
 
 

@@ -278,3 +278,23 @@ def test_a_video_that_changes_while_it_is_read(lab: Lab) -> None:
 def test_an_orphan_beside_no_video_is_mentioned(lab: Lab) -> None:
     (lab.clips / "cta.hint.txt").write_text("x")
     assert "note: cta.hint.txt belongs to no video here" in lab.run("--until", "words").out
+
+
+def test_a_video_replaced_between_plan_and_start_is_planned_anew(lab: Lab) -> None:
+    child = lab.spawn("--words.delay_s", "0.3", "--execution.cpus", "1", "--until", "words")
+    wait_for(lambda: list(lab.workspace.glob("runs/*/logs/words-cat.txt")))
+    (lab.clips / "dog.MOV").write_text("quite another dog")
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 0, out + err
+    assert "quite another dog" in (lab.workspace / "latest/videos/dog/words/000.txt").read_text()
+    assert lab.pending("--until", "words", "--words.delay_s", "0.3") == {}, "filed under what was read"
+
+
+def test_a_video_that_vanishes_under_way_spares_the_others(lab: Lab) -> None:
+    child = lab.spawn("--words.delay_s", "0.3", "--execution.cpus", "1", "--until", "words")
+    wait_for(lambda: list(lab.workspace.glob("runs/*/logs/words-cat.txt")))
+    (lab.clips / "dog.MOV").unlink()
+    _, err = child.communicate(timeout=60)
+    assert child.returncode == 2
+    assert "dog.MOV: it cannot be read (no such file)" in err and err.count("\n") == 1
+    assert set(lab.records()) == {"words/cat"}
