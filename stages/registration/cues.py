@@ -86,14 +86,20 @@ def crop_frame(
     return small, colour, motion, confidence
 
 
-def inflate(masks: np.ndarray, iterations: int = 250) -> np.ndarray:
-    """Half thickness (T, S, S), in pixels, of a rounded body with these (T, S, S) silhouettes.
+def inflate(masks: np.ndarray, iterations: int = 200) -> np.ndarray:
+    """Half thickness (T, S, S), in pixels, of a rounded body with these (T, S, S) silhouettes (S even).
 
     Solves ``laplace(h) = -3`` inside, ``h = 0`` outside, and returns ``sqrt(h)``: a disc becomes nearly a ball
     (exactly so for -4), a bar nearly a round bar (exactly so for -2). No claim beyond being convex towards the camera.
+    Solved by relaxation, first at half the resolution, where it converges four times sooner.
     """
-    inside = (masks > 0.5).astype(np.float32)
-    height = np.zeros_like(inside)
+    count, size = masks.shape[:2]
+    half = masks.reshape(count, size // 2, 2, size // 2, 2).mean(axis=(2, 4))
+    coarse = _relax(np.zeros_like(half, np.float32), half > 0.5, iterations)
+    return np.sqrt(_relax(4 * coarse.repeat(2, axis=1).repeat(2, axis=2), masks > 0.5, iterations // 5))
+
+
+def _relax(height: np.ndarray, inside: np.ndarray, iterations: int) -> np.ndarray:
     for _ in range(iterations):
         total = np.zeros_like(height)
         total[:, 1:] += height[:, :-1]
@@ -101,4 +107,4 @@ def inflate(masks: np.ndarray, iterations: int = 250) -> np.ndarray:
         total[:, :, 1:] += height[:, :, :-1]
         total[:, :, :-1] += height[:, :, 1:]
         height = inside * (total + 3.0) / 4.0
-    return np.sqrt(height)
+    return height

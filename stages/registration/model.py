@@ -159,7 +159,9 @@ class Hypothesis:
         # the overall scale is free: hold its mean where the first guess had it
         gauge = float(torch.cat(first).mean() - torch.cat(found).mean())
         for k, units in zip(clips, found, strict=True):
-            track = torch.as_tensor(smooth(units.numpy().astype(np.float64), 3.0), dtype=torch.float32) + gauge
+            half = torch.log(self.sequences[k].windows.half)  # distance is smooth in time, the crop's side is not
+            distance = smooth((units - half).numpy().astype(np.float64), 3.0)
+            track = torch.as_tensor(distance, dtype=torch.float32) + half + gauge
             self.units[k] = torch.exp(0.5 * track + 0.5 * torch.log(self.units[k]))
         axis = pixel_axis(self.voxels) * EXTENT
         total = occupancy.sum().clamp(min=1e-3)

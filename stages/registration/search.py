@@ -183,7 +183,8 @@ def _answer(subject: Subject, k: int, best: Hypothesis, rivals: list[Hypothesis]
     every = np.arange(len(subject.cues))
     azimuth = smooth(np.interp(every, chosen, np.unwrap(azimuth)), 2.0)
     elevation = smooth(np.interp(every, chosen, elevation), 3.0)
-    units = np.interp(every, chosen, best.units[k].numpy())
+    half = subject.cues.half_px
+    units = half * np.interp(every, chosen, best.units[k].numpy() / half[chosen])
     share = best.posterior[k].reshape(len(chosen), -1)
     shift = (share @ best.offset.numpy()) * EXTENT / best.units[k].numpy()[:, None]  # of the centroid, half crops
     offset = np.stack([np.interp(every, chosen, s) for s in (best.sequences[k].windows.centre.numpy() - shift).T], 1)

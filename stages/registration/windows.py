@@ -30,7 +30,7 @@ class Windows:
         self.colour = colour / brightness.clamp(min=1e-3)  # exposure differs from clip to clip
         self.weight = torch.as_tensor(np.where(some.cut, 0.3, 1.0) * some.known, dtype=torch.float32)
         self.centre, self.area = centre_and_area(self.mask)
-        half = torch.as_tensor(some.half_px, dtype=torch.float32)
+        self.half = half = torch.as_tensor(some.half_px, dtype=torch.float32)
         # first guess: the camera keeps its distance, and the object shows its full length (2 units) at times
         self.first_units = CROP_MARGIN * half / torch.quantile(half, 0.8)
         self.units = self.first_units.clone()
