@@ -11,6 +11,7 @@ import numpy as np
 from pipeline import BadInput, Folder, Given, Resources, Run, Scene, stage
 from stages import formats
 from stages.registration.answer import Answer, Provider, Subject
+from stages.registration.combine import combine
 from stages.registration.cues import CROP_MARGIN, Cues, crop_frame
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
 from stages.registration.placing import (
@@ -24,13 +25,16 @@ from stages.registration.placing import (
 )
 from stages.registration.search import search
 from stages.registration.sheets import draw_pose, pose_sheet
+from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
 CROP_PX = 48
 LOW_TRUST = 0.5
 GIVEN = ".poses.json"
-PROVIDERS: dict[str, Provider] = {"search": search, "upright": upright}
-"""Providers by name, best first; `auto` takes, clip by clip, the answer that is trusted most."""
+PROVIDERS: dict[str, Provider] = {"search": search, "colmap": structure_from_motion, "upright": upright}
+"""Providers by name, best first; `auto` takes the answers that are trusted most (see combine)."""
+LAST_RESORTS = ("colmap", "upright")
+"""Providers that `auto` asks only where the ones before left doubt."""
 
 
 @dataclass(frozen=True)
@@ -135,35 +139,39 @@ def _subject(
     edge = np.array([clip.width, clip.height, clip.width, clip.height]) - boxes
     cut = (boxes[:, :2] <= 1).any(axis=1) | (edge[:, 2:] <= 1).any(axis=1)
     cues = Cues(mask, colour, flow_px, confidence, centre, half, boxes, known, cut, step)
+
+    def frame(i: int) -> tuple[np.ndarray, np.ndarray]:
+        return clip.image(i), formats.read_grey(masks / clip.names[i])
+
     if track is None:
-        return Subject(name, cues, default_intrinsics(clip.width, clip.height, settings.focal_px or clip.focal_hint_px))
+        intrinsics = default_intrinsics(clip.width, clip.height, settings.focal_px or clip.focal_hint_px)
+        return Subject(name, cues, intrinsics, None, frame)
     turned = ray_rotation(centre, track.intrinsics).transpose(0, 2, 1)
-    return Subject(name, cues, track.intrinsics, turned @ track.object_to_camera[:, :3, :3])
+    return Subject(name, cues, track.intrinsics, turned @ track.object_to_camera[:, :3, :3], frame)
 
 
 def _ask(
     subjects: list[Subject], asked: list[str], settings: PosesSettings, run: Run
 ) -> tuple[dict[str, Answer], list[dict[str, object]]]:
-    """Ask the providers in order; keep for each clip the answer with the highest trust."""
+    """Ask the providers in order, and bring their answers together."""
     names = list(PROVIDERS) if settings.provider == "auto" else [settings.provider, "upright"]
-    best: dict[str, Answer] = {}
     tried: list[dict[str, object]] = []
+    answers: list[dict[str, Answer]] = []
+
+    def tell(done: int, total: int, label: str) -> None:
+        run.tick(done, total, label=label)
+        if run.stop_requested:
+            run.interrupt()
+
     for provider in dict.fromkeys(names):
-        if all(name in best for name in asked) and settings.provider != "auto":
-            break
-
-        def tell(done: int, total: int, label: str) -> None:
-            run.tick(done, total, label=label)
-            if run.stop_requested:
-                run.interrupt()
-
+        answered = [a[n].trust for a in answers for n in asked if n in a]
+        if provider in LAST_RESORTS and len(answered) >= len(asked) and min(answered) >= LOW_TRUST:
+            continue
         found = PROVIDERS[provider](subjects, settings.seed, tell)
+        answers.append(found)
         figures = {n: {"trust": round(a.trust, 3), **a.score} for n, a in found.items()}
         tried.append({"provider": provider, "videos": figures})
-        for name in asked:
-            if name in found and (name not in best or found[name].trust > best[name].trust):
-                best[name] = found[name]
-    return best, tried
+    return combine(answers, asked), tried
 
 
 def _track(subject: Subject, answer: Answer) -> formats.PoseTrack:

@@ -19,6 +19,8 @@ class Subject:
     cues: Cues
     intrinsics: np.ndarray  # (3, 3) pixels
     rotation: np.ndarray | None = None  # (T, 3, 3) object to crop camera, known exactly
+    frame: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
+    """Full picture (H, W, 3) and mask (H, W) uint8 of one kept frame, for providers that need more than crops."""
 
 
 @dataclass(frozen=True)

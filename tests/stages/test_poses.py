@@ -149,29 +149,35 @@ def test_upright_is_always_an_answer_and_never_boasts(tmp_path: Path, clips: dic
     assert summary["trust"] == pytest.approx(0.05) and "a, b" in summary["advice"]
 
 
-def test_the_most_trusted_answer_wins_clip_by_clip(
+def test_the_most_trusted_provider_wins_and_others_fill_in(
     tmp_path: Path, clips: dict[str, np.ndarray], monkeypatch: Any
 ) -> None:
-    def say(name: str, trusts: dict[str, float]) -> Any:
+    front = np.diag([1.0, -1.0, -1.0])
+    quarter = view_rotation(np.array(np.pi / 2), np.array(0.0)).T @ front
+
+    def say(name: str, trusts: dict[str, float], frame: np.ndarray) -> Any:
         def provider(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
             tell(1, 1, name)
             answers = {}
             for s in subjects:
                 if s.name in trusts:
-                    turn = np.tile(np.diag([1.0, -1.0, -1.0]), (len(s.cues), 1, 1))
+                    turn = np.tile(front @ frame, (len(s.cues), 1, 1))
                     sure = np.full(len(s.cues), trusts[s.name])
                     answers[s.name] = Answer(name, turn, np.full(len(s.cues), 2.0), s.cues.centre_px, sure, sure[0])
             return answers
 
         return provider
 
-    providers = {"one": say("one", {"a": 0.9, "b": 0.2}), "two": say("two", {"a": 0.3, "b": 0.8})}
+    # "one" is trusted most but knows only a; "two" knows both, in an object frame turned by a quarter
+    providers = {"one": say("one", {"a": 0.9}, np.eye(3)), "two": say("two", {"a": 0.3, "b": 0.5}, quarter)}
     monkeypatch.setattr(stage_module, "PROVIDERS", {**providers, "upright": stage_module.PROVIDERS["upright"]})
     out, run = run_poses(tmp_path)
     summary = read_json(out / "poses.json")
     assert summary["won"] == {"a": "one", "b": "two"}
     assert [p["provider"] for p in summary["providers_tried"]] == ["one", "two", "upright"]
-    assert summary["trust"] == 0.8 and run.warnings == []
+    first, second = (read_poses(out / f"{n}.json").object_to_camera[0, :3, :3] for n in "ab")
+    assert np.abs(first - second).max() < 0.15  # in one frame (up to where each object is in the picture)
+    assert summary["trust"] == 0.5 and run.warnings == []
 
 
 def test_an_empty_mask_is_said(tmp_path: Path) -> None:
