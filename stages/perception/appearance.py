@@ -71,10 +71,10 @@ class PixelColours:
 
 def _block(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode="replicate"),
+        nn.Conv2d(inputs, outputs, 3, padding=1),
         nn.GroupNorm(4, outputs),
         nn.ReLU(),
-        nn.Conv2d(outputs, outputs, 3, padding=1, padding_mode="replicate"),
+        nn.Conv2d(outputs, outputs, 3, padding=1),
         nn.GroupNorm(4, outputs),
         nn.ReLU(),
     )
@@ -85,14 +85,12 @@ class _SmallUnet(nn.Module):
 
     def __init__(self, width: int = 16) -> None:
         super().__init__()
-        self.stem = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1, padding_mode="replicate"), nn.ReLU())
+        self.stem = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.ReLU())
         self.at_half = _block(8, width)
         self.at_quarter = _block(width, 2 * width)
         self.join = _block(3 * width, width)
         self.narrow = nn.Conv2d(width, 8, 1)
-        self.head = nn.Sequential(
-            nn.Conv2d(16, 8, 3, padding=1, padding_mode="replicate"), nn.ReLU(), nn.Conv2d(8, 1, 1)
-        )
+        self.head = nn.Sequential(nn.Conv2d(16, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 1, 1))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         stem = self.stem(x)
@@ -109,7 +107,7 @@ class ClipNetwork:
 
     def __init__(self, seed: int) -> None:
         self.generator = torch.Generator().manual_seed(seed)
-        self.net = _SmallUnet()
+        self.net = _SmallUnet().to(memory_format=torch.channels_last)  # more than twice as fast on a CPU
         _seed_weights(self.net, self.generator)
 
     def fit(
@@ -118,7 +116,7 @@ class ClipNetwork:
         target: np.ndarray,
         weight: np.ndarray,
         steps: int,
-        batch: int = 8,
+        batch: int = 6,
         patch_px: int = 96,
         tick: Callable[[int], None] = lambda done: None,
     ) -> None:
@@ -143,18 +141,23 @@ class ClipNetwork:
     def _patches(
         self, x: torch.Tensor, y: torch.Tensor, w: torch.Tensor, batch: int, patch_px: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Random patches of the crops, inputs, targets and weights stacked."""
-        height, width = min(patch_px, x.shape[2]), min(patch_px, x.shape[3])
+        """Random patches of the crops at 0.7 to 1.5 times their size: inputs, targets and weights, stacked."""
         picked = []
         for _ in range(batch):
+            zoom = float(torch.empty(1).uniform_(-0.35, 0.4, generator=self.generator).exp())
+            side = round(patch_px / zoom)
+            height, width = min(side, x.shape[2]), min(side, x.shape[3])
             n, top, left = (
                 int(torch.randint(high, (1,), generator=self.generator))
                 for high in (len(x), x.shape[2] - height + 1, x.shape[3] - width + 1)
             )
             rows, columns = slice(top, top + height), slice(left, left + width)
-            picked.append((x[n, :, rows, columns], y[n, rows, columns], w[n, rows, columns]))
-        inputs, wanted, trust = (torch.stack(parts) for parts in zip(*picked, strict=True))
-        return inputs, wanted, trust
+            patch = torch.cat([x[n, :, rows, columns], y[n, None, rows, columns], w[n, None, rows, columns]])[None]
+            picked.append(
+                functional.interpolate(patch, size=(patch_px, patch_px), mode="bilinear", align_corners=False)
+            )
+        stacked = torch.cat(picked)
+        return stacked[:, :3], stacked[:, 3], stacked[:, 4]
 
     @torch.no_grad()
     def logit(self, crops: np.ndarray) -> np.ndarray:

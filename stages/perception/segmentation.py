@@ -112,38 +112,47 @@ def segment(
 def coarse_probability(
     work: list[np.ndarray], cues: MotionCues, told: np.ndarray, carrier: Carrier, effort: Effort
 ) -> np.ndarray:
-    """(T, h, w) probability from motion evidence and colours in their surroundings; finds the object, a little fat."""
-    count = len(work)
-    centre = np.exp(-0.5 * (border_distance(*work[0].shape[:2]) / 0.75) ** 6)
-    seed = np.clip(cues.evidence / 1.5, 0, 1) * centre * np.clip(cues.moving / 0.3, 0, 1)
+    """(T, h, w) probability from motion evidence and colours in their surroundings; finds the object, a little fat.
+
+    Worked out at half the size of the cues.
+    """
+    height, width = work[0].shape[:2]
+    half = [cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA) for image in work]
+    evidence, moving, told = (_resized(maps, width // 2, height // 2) for maps in (cues.evidence, cues.moving, told))
+    centre = np.exp(-0.5 * (border_distance(height // 2, width // 2) / 0.75) ** 6)
+    seed = np.clip(evidence / 1.5, 0, 1) * centre * np.clip(moving / 0.3, 0, 1)
     seed = np.where(told > 0.5, np.maximum(seed, np.clip(told / 3, 0, 1)), np.where(told < -0.5, 0, seed))
-    near = carrier.spread(_nearness(seed, 6.0), 0.95)
-    away = np.clip(1 - 4 * near, 0, 1) * (cues.evidence < 0.5) * np.clip(1.3 - 2 * cues.moving, 0.2, 1)
+    near = carrier.spread(_nearness(seed, 3.0), 0.95)
+    away = np.clip(1 - 4 * near, 0, 1) * (evidence < 0.5) * np.clip(1.3 - 2 * moving, 0.2, 1)
     away = np.where(told < -0.5, 1.0, away)
     label = (seed > away).astype(np.float32)
     weight = np.where(seed > 0.2, seed, np.where(away > 0.2, 0.7 * away, 0)).astype(np.float32)
-    values = np.stack([_coloured_surroundings(image) for image in work])
+    values = np.stack([_coloured_surroundings(image) for image in half])
     soft = seed.astype(np.float32)
     for turn in range(effort.rounds):
         colours = PixelColours(values.shape[-1], effort.seed + turn)
         if not colours.fit(values, label, weight):
             break
-        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 1.0) for x in colours.logit(values)])
+        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.6) for x in colours.logit(values)])
         place = 1.5 * np.log(np.clip(3 * near, 0.03, 1))
-        logit = looks - 0.7 + 0.8 * np.clip(cues.evidence, -1, 3) + place + told
-        soft = _sigmoid(logit)
-        near = carrier.spread(_nearness(np.where(soft > 0.5, soft, 0), 8.0), 0.95)
+        soft = _sigmoid(looks - 0.7 + 0.8 * np.clip(evidence, -1, 3) + place + told)
+        near = carrier.spread(_nearness(np.where(soft > 0.5, soft, 0), 4.0), 0.95)
         label = (soft > 0.5).astype(np.float32)
         sure = np.abs(soft - 0.5) * 2
         weight = np.where(sure > 0.4, sure, 0).astype(np.float32)
-    return np.stack([main_component(soft[t] > 0.5, soft[t]) * soft[t] for t in range(count)])
+    return _resized(np.stack([main_component(s > 0.5, s) * s for s in soft]), width, height)
 
 
 def tight_probability(
     work: list[np.ndarray], soft: np.ndarray, cues: MotionCues, told: np.ndarray, effort: Effort, rim_px: int = 3
 ) -> np.ndarray:
-    """(T, h, w) probability from plain colours, fitted without the rim of the mask, where the labels are least sure."""
+    """(T, h, w) probability from plain colours, fitted without the rim of the mask, where the labels are least sure.
+
+    Colours count as far as they tell the core from its surroundings in this clip at all; the rest is left to the depth
+    inside the coarse outline, which is about as fat as the rim.
+    """
     values = np.stack([scaled_lab(image) for image in work])
+    depth = np.stack([_signed_distance(s > 0.5) for s in soft])
     found = soft
     for turn in range(2):
         core, off, close = _rim(found > 0.5, max(1, rim_px - turn))
@@ -151,8 +160,15 @@ def tight_probability(
         colours = PixelColours(values.shape[-1], effort.seed + 10 + turn)
         if not colours.fit(values, core, weight, steps=500):
             return found
-        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.8) for x in colours.logit(values)])
-        logit = looks - 1.0 + 0.5 * np.clip(cues.evidence, -1, 3) + told
+        looks = np.full(found.shape, -6.0, np.float32)
+        looks[~off] = colours.logit(values[~off])
+        beside = off & close
+        right = ((looks[core > 0] > 0).mean() + (colours.logit(values[beside]) < 0).mean()) / 2
+        told_apart = float(np.clip((right - 0.8) / 0.15, 0, 1))
+        looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.8) for x in looks])
+        place = (1.0 - 0.7 * told_apart) * np.clip(0.5 * (depth - rim_px), -3.0, 3.0)
+        looks = (0.4 + 0.6 * told_apart) * (looks - 0.5 - 1.3 * told_apart)
+        logit = looks + place + 0.5 * np.clip(cues.evidence, -1, 3) + told
         found = np.where(off, 0.002, _sigmoid(logit)).astype(np.float32)
         found = np.stack([main_component(f > 0.5, f) * f for f in found])
     return found
@@ -168,6 +184,7 @@ def network_probability(work: list[np.ndarray], soft: np.ndarray, told: np.ndarr
     lab = np.stack([scaled_lab(work[t])[w] for t, w in enumerate(windows)])
     target = np.stack([soft[t][w] for t, w in enumerate(windows)])
     weight = np.clip(np.abs(target - 0.5) * 2, 0.05, 1)
+    weight[_gaps(target > 0.5) & (target < 0.5)] *= 0.3
     network = ClipNetwork(effort.seed + 20)
     network.fit(lab, target, weight, effort.network_steps)
     logit = network.logit(lab)
@@ -216,6 +233,12 @@ def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[in
     return out
 
 
+def _resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(T, height, width) float32 of maps of another size."""
+    kind = cv2.INTER_AREA if width < maps.shape[2] else cv2.INTER_LINEAR
+    return np.stack([cv2.resize(m.astype(np.float32), (width, height), interpolation=kind) for m in maps])
+
+
 def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
     """Blurred maps, each scaled so that its top per cent is at 1."""
     blurred = np.stack([cv2.GaussianBlur(m.astype(np.float32), (0, 0), sigma_px) for m in maps])
@@ -226,9 +249,16 @@ def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
 def _coloured_surroundings(image: np.ndarray) -> np.ndarray:
     """(h, w, 12) float32: Lab as it is, blurred twice, and its local spread."""
     lab = scaled_lab(image)
-    spread = cv2.GaussianBlur(lab**2, (0, 0), 2.0) - cv2.GaussianBlur(lab, (0, 0), 2.0) ** 2
-    blurred = [cv2.GaussianBlur(lab, (0, 0), s) for s in (1.5, 3.0)]
+    spread = cv2.GaussianBlur(lab**2, (0, 0), 1.2) - cv2.GaussianBlur(lab, (0, 0), 1.2) ** 2
+    blurred = [cv2.GaussianBlur(lab, (0, 0), s) for s in (0.8, 1.6)]
     return np.concatenate([lab, *blurred, 3 * np.sqrt(np.maximum(spread, 0))], axis=-1)
+
+
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
+    """(h, w) distance to the outline in pixels, positive inside."""
+    eight = mask.astype(np.uint8)
+    inside = cv2.distanceTransform(eight, cv2.DIST_L2, 3)
+    return np.where(mask, inside, -cv2.distanceTransform(1 - eight, cv2.DIST_L2, 3)).astype(np.float32)
 
 
 def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -240,6 +270,16 @@ def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.nda
     off = np.stack([cv2.dilate(m, disc) for m in eight]) == 0
     close = np.stack([cv2.dilate(m, wide) for m in eight]) > 0
     return core.astype(np.float32), off, close
+
+
+def _gaps(masks: np.ndarray) -> np.ndarray:
+    """What closing fills in boolean (T, h, w) masks: gaps up to a tenth of their extent, where labels are doubtful."""
+    out = np.zeros_like(masks)
+    for t, mask in enumerate(masks):
+        reach = max(1, round(0.12 * np.sqrt(mask.sum())))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        out[t] = (cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0) & ~mask
+    return out
 
 
 def _crop_window(mask: np.ndarray, shape: tuple[int, ...], margin: float = 0.2) -> tuple[int, int, int, int]:
