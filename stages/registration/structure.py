@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from stages.registration.answer import Answer, Subject, Tell
 from stages.registration.placing import depth_from_size, ray_rotation
 
-MOST_FRAMES = 40
-"""Frames a clip."""
+MOST_FRAMES = 96
+"""Frames of all clips together: every pair is matched."""
 LEAST_SHARE = 0.3
 """A clip with a smaller share of its frames registered gets no answer."""
 _LONG_SIDE_PX = 640
@@ -27,10 +27,11 @@ def structure_from_motion(subjects: list[Subject], seed: int, tell: Tell) -> dic
     interpolated, with the less confidence the further the next registered frame is. "Up" is the cameras' mean up.
     """
     usable = [s for s in subjects if s.frame is not None]
+    most = max(8, MOST_FRAMES // max(len(usable), 1))
     if not usable:
         return {}
     with tempfile.TemporaryDirectory(prefix="structure-") as scratch:
-        model = _reconstruct(usable, Path(scratch), seed, tell)
+        model = _reconstruct(usable, most, Path(scratch), seed, tell)
     if model is None:
         return {}
     poses, centre, size, error_px = model
@@ -39,19 +40,19 @@ def structure_from_motion(subjects: list[Subject], seed: int, tell: Tell) -> dic
     answers = {}
     for subject in usable:
         found = poses.get(subject.name, {})
-        chosen = len(_chosen(subject))
+        chosen = len(_chosen(subject, most))
         if subject.rotation is None and len(found) >= max(2, LEAST_SHARE * chosen):
             answers[subject.name] = _answer(subject, found, chosen, centre, size, world, error_px)
     return answers
 
 
-def _chosen(subject: Subject) -> np.ndarray:
+def _chosen(subject: Subject, most: int) -> np.ndarray:
     count = len(subject.cues)
-    return np.unique(np.round(np.linspace(0, count - 1, min(count, MOST_FRAMES))).astype(int))
+    return np.unique(np.round(np.linspace(0, count - 1, min(count, most))).astype(int))
 
 
 def _reconstruct(
-    subjects: list[Subject], scratch: Path, seed: int, tell: Tell
+    subjects: list[Subject], most: int, scratch: Path, seed: int, tell: Tell
 ) -> tuple[dict[str, dict[int, tuple[np.ndarray, np.ndarray]]], np.ndarray, float, float] | None:
     """Camera-from-world of the largest model by clip and frame, its points' centre and half length, pixel error."""
     import pycolmap  # heavy, and only this provider needs it
@@ -61,7 +62,7 @@ def _reconstruct(
     pictures, database = scratch / "pictures", scratch / "database.db"
     for done, (label, subject) in enumerate((f"clip{k:04d}", s) for k, s in enumerate(subjects)):
         tell(done, len(subjects) + 2, "finding features")
-        names, camera = _write(subject, label, pictures)
+        names, camera = _write(subject, most, label, pictures)
         options: dict[str, Any] = {"camera_model": "PINHOLE", "camera_params": camera, "mask_path": scratch / "masks"}
         extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
         extraction.sift.peak_threshold = 0.003  # fur and cloth are faint
@@ -99,14 +100,14 @@ def _reconstruct(
     return poses, centre, max(size, 1e-9), float(best.compute_mean_reprojection_error())
 
 
-def _write(subject: Subject, label: str, pictures: Path) -> tuple[list[str], str]:
+def _write(subject: Subject, most: int, label: str, pictures: Path) -> tuple[list[str], str]:
     """Frames and masks of one clip as PNG for the extractor; their names, and the camera's parameters as text."""
     assert subject.frame is not None
     masks = pictures.parent / "masks"
     (pictures / label).mkdir(parents=True)
     (masks / label).mkdir(parents=True)
     names, factor = [], 1.0
-    for i in _chosen(subject):
+    for i in _chosen(subject, most):
         image, mask = subject.frame(int(i))
         factor = max(1.0, _LONG_SIDE_PX / max(image.shape[:2]))
         size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
