@@ -183,6 +183,31 @@ def _broken(path: Path, count: int, stream: av.VideoStream, reason: str) -> BadI
     )
 
 
+@dataclass(frozen=True)
+class Glance:
+    """What a file says of itself without being decoded."""
+
+    width: int
+    height: int
+    frames: int
+
+
+def glance(path: Path) -> Glance | None:
+    """Size and number of frames as the container states them (a guess where it does not); None where it cannot."""
+    try:
+        if path.is_dir():
+            paths = list_images(path)
+            with Image.open(paths[0]) as image:
+                return Glance(*image.size, len(paths))
+        with _open(path) as container:
+            stream = container.streams.video[0]
+            seconds = (container.duration or 0) / 1e6
+            rate = float(stream.average_rate or 25.0)
+            return Glance(stream.width, stream.height, stream.frames or max(1, round(seconds * rate)))
+    except (BadInput, IndexError, OSError, SyntaxError):
+        return None
+
+
 # --------------------------------------------------------------------------------------------- focal length
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Video, stage
+from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Source, Video, stage
+from stages.decoding import glance
 from stages.formats import (
     FLOW_STEPS,
     Clip,
@@ -40,6 +41,7 @@ from stages.perception.optical_flow import (
     round_trip_error,
     shared_window,
 )
+from stages.perception.sampling import fit_size
 from stages.perception.sheets import flow_colours, pick, tile
 
 
@@ -232,6 +234,17 @@ def _check(out: Path, frames: Folder) -> None:
     )
     if values.shape[:2] != (clip.height, clip.width):
         raise FormatError(f"flow is {values.shape[1]}x{values.shape[0]}, frames {clip.width}x{clip.height}")
+
+
+@flow.estimate
+def _bytes(video: Source, settings: FlowSettings) -> int:
+    """About a byte a pixel, pair and direction; how many frames will be kept is a guess from the defaults of `frames`."""
+    seen = glance(video.path)
+    if seen is None:
+        return 0
+    width, height = fit_size(seen.width, seen.height, 480)
+    kept = min(seen.frames, 150)
+    return 2 * width * height * sum(max(0, kept - step) for step in settings.steps)
 
 
 @flow.sheet

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from pipeline import BadInput, Resources, Run, Source, Video, stage
-from stages.decoding import Frame, focal_hint, is_high_dynamic_range, read_frames
+from stages.decoding import Frame, focal_hint, glance, is_high_dynamic_range, read_frames
 from stages.formats import Clip, FormatError, frame_name, read_clip, read_image, write_clip_info, write_image
 from stages.perception.sampling import at_rate, evenly_in_time, fit_size, moving_frames, thumbnail
 from stages.perception.sheets import frame_sheet
@@ -150,6 +150,17 @@ def _check(out: Path) -> None:
             raise FormatError(
                 f"{name} is {image.shape[1]}x{image.shape[0]}, frames.json says {clip.width}x{clip.height}"
             )
+
+
+@frames.estimate
+def _bytes(video: Source, settings: FrameSettings) -> int:
+    """PNGs of noisy video take up to 2 bytes a pixel. What cannot be opened is the stage's to refuse."""
+    seen = glance(video.path)
+    if seen is None:
+        return 0
+    width, height = fit_size(seen.width, seen.height, settings.max_side_px)
+    kept = min(seen.frames, settings.max_frames) if settings.max_frames > 0 else seen.frames
+    return 2 * width * height * kept
 
 
 @frames.sheet

@@ -12,7 +12,7 @@ from PIL import Image
 
 from pipeline import BadInput, Folder, Run, Source
 from stages.formats import read_clip
-from stages.frames import FrameSettings, _check, frames
+from stages.frames import FrameSettings, _bytes, _check, frames
 from stages.perception.sampling import at_rate, evenly_in_time, fit_size, moving_frames
 from tests.stages.perception_clips import frames_of, moving_clip, write_pngs, write_video
 
@@ -243,3 +243,16 @@ def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
         folders.append(Folder(out))
     for path in sorted(folders[0].path.iterdir()):
         assert path.read_bytes() == (folders[1] / path.name).read_bytes()
+
+
+def test_disk_estimate_is_above_what_is_written(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "clip.mkv", IMAGES, "ffv1", "yuv444p")
+    folder = frames_of(video, tmp_path / "out")
+    written = sum(p.stat().st_size for p in folder.path.iterdir())
+    estimate = _bytes(Source(video, "clip"), FrameSettings())
+    assert 0.5 * written < estimate < 4 * written
+    assert _bytes(Source(video, "clip"), FrameSettings(max_frames=4)) == estimate // 2
+    (tmp_path / "noise.mp4").write_bytes(b"no video")
+    assert _bytes(Source(tmp_path / "noise.mp4", "noise"), FrameSettings()) == 0
+    pictures = write_pngs(tmp_path / "pictures", IMAGES)
+    assert _bytes(Source(pictures, "pictures", is_folder=True), FrameSettings()) == estimate
