@@ -7,7 +7,6 @@ is stopped continues from its last checkpoint, bit for bit on a CPU.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,20 +14,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline import Folder, Resources, Run, Scene, stage
+from pipeline import BadInput, Folder, Resources, Run, Scene, stage
 from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection, collect
 from stages.fitting import initialise
-from stages.fitting.begin import Beginning, first_model
 from stages.fitting.preview import preview_sheet
 from stages.fitting.schedule import PhaseSettings
 from stages.fitting.trainer import Diverged, Trainer
 from stages.model.banmo import Architecture, Banmo
-from stages.model.skeleton import Bones
 
 _CHECKPOINT_STEPS = 50
 _METRIC_STEPS = 10
+_HULL_VOXEL = 0.032
 
 
 @dataclass(frozen=True)
@@ -46,11 +44,11 @@ class FitSettings(PhaseSettings):
     bones: int = 25
     """Number of bones."""
     start: str = "hull"
-    """hull (soft visual hull of the masks, limbs and motion first) or sphere (the paper's)."""
-    limb_rounds: int = 2
-    """How often limbs that the hull missed are looked for."""
-    motion_iterations: int = 150
-    """Steps of each fit of the motion to the masks before rendering begins."""
+    """hull (soft visual hull of the masks) or sphere (the paper's)."""
+    margin: float = 0.3
+    """Room for limbs around the first hull (object about 2 long)."""
+    renew_at: float = 2.0
+    """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
     flow_steps: tuple[int, ...] = (1, 4)
@@ -175,28 +173,32 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
     free = 1 - collection.root_fixed
     if settings.start == "sphere":
         generator = torch.Generator().manual_seed(settings.seed)
-        sphere = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
-        sphere = sphere * 0.5 * torch.rand(4000, 1, generator=generator) ** (1 / 3)
-        model = initialise.build(
-            architecture, collection.videos, normal.camera_from_canonical, sphere, 0.08, settings.bones, settings.seed, 0.7
+        solid = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
+        solid = solid * 0.5 * torch.rand(4000, 1, generator=generator) ** (1 / 3)
+    else:
+        hull = initialise.rigid_hull(
+            collection.observations, normal.camera_from_canonical, collection.intrinsics, _HULL_VOXEL
         )
-        model.root_free.copy_(free)
-        return model
-    beginning = Beginning(
-        bones=settings.bones, limb_rounds=settings.limb_rounds, motion_iterations=settings.motion_iterations
-    )
-    return first_model(
-        collection.observations,
-        normal.camera_from_canonical,
-        collection.intrinsics,
-        collection.videos,
+        solid = hull.nodes[hull.solid]
+        run.log.info("hull: vote level %.2f, %d voxels", hull.level, len(solid))
+        run.metric("hull_level", hull.level)
+        if len(solid) < 50:
+            raise BadInput(
+                "masks and root poses do not agree on any solid object",
+                hint="look at latest/videos/*/masks and `banmo inspect poses`, or give masks and poses",
+            )
+    model = initialise.build(
         architecture,
-        beginning,
-        settings,
-        free,
-        lambda steps: run.progress(steps, label="motion before rendering"),
-        run.log,
+        collection.videos,
+        normal.camera_from_canonical,
+        solid,
+        _HULL_VOXEL,
+        settings.bones,
+        settings.seed,
+        settings.margin,
     )
+    model.root_free.copy_(free)
+    return model
 
 
 def _continue(before: Folder, collection: Collection, settings: PhaseSettings, out: Path, run: Run) -> None:
@@ -242,6 +244,8 @@ def _run_phase(
                 raise
             run.warn(f"{error}; continued from step {saved.step} with half the step size")
             scale = trainer.rate_scale / 2
+            model = Banmo.restore(saved.model_tensors(), saved.description)
+            trainer = Trainer(model, collection.observations, settings)
             trainer.restore(saved.tensors)
             trainer.rate_scale, history = scale, saved.history
             continue

@@ -54,13 +54,13 @@ def object_box(observations: Observations, camera_from_object: Tensor, intrinsic
     # A weak pull to the middle of the clips' look-at depth keeps a single static view well posed.
     weight = 1e-3 * len(radii)
     depth = torch.stack([camera_from_object[f, 2, 3].double() for f, _, _ in radii]).median()
-    prior = torch.stack(
-        [camera_from_object[f, :3, :3].double().T @ (torch.tensor([0, 0, 1.0]).double() * depth - camera_from_object[f, :3, 3].double()) for f, _, _ in radii]
-    ).mean(0)
+    ahead = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) * depth
+    used = camera_from_object[[int(f) for f, _, _ in radii]].double()
+    prior = ((ahead - used[:, :3, 3])[:, None] @ used[:, :3, :3])[:, 0].mean(0)
     centre = torch.linalg.solve(normal + weight * torch.eye(3, dtype=torch.float64), right + weight * prior)
-    extent = [
-        radius / focal * float(transform(camera_from_object[f].double(), centre[None])[0, 2]) for f, radius, focal in radii
-    ]
+    extent = []
+    for f, radius, focal in radii:
+        extent.append(radius / focal * float(transform(camera_from_object[f].double(), centre[None])[0, 2]))
     return centre.float(), float(torch.quantile(torch.tensor(extent, dtype=torch.float64), 0.9))
 
 
@@ -120,8 +120,8 @@ def choose_level(
 
 
 def largest_component(solid: np.ndarray) -> np.ndarray:
-    """The largest connected part of a boolean volume."""
-    labels, count = label(solid)
+    """The largest connected part of a boolean volume; corners connect, as thin limbs run diagonally."""
+    labels, count = label(solid, structure=np.ones((3, 3, 3)))
     if count <= 1:
         return solid
     sizes = np.bincount(labels.ravel())

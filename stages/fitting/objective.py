@@ -102,7 +102,13 @@ def render(
 
 
 def evaluate(
-    model: Banmo, boxes: Tensor, batch: Batch, settings: PhaseSettings, beta: float, step: int, generator: torch.Generator
+    model: Banmo,
+    boxes: Tensor,
+    batch: Batch,
+    settings: PhaseSettings,
+    beta: float,
+    step: int,
+    generator: torch.Generator,
 ) -> dict[str, Tensor]:
     """Every active term of the objective, already weighted; their sum is minimised."""
     prepared = model.field.prepare()
@@ -240,14 +246,18 @@ def motion_terms(
     whole = (video[:, 0] == video[:, 2]).float()
     flat = triple.reshape(-1)
     centres = model.bones.centres
-    transforms, shift, _ = model.body(model.video_idx[flat], model.time[flat], centres, model.bones.parents)
+    transforms, own, _ = model.body(model.video_idx[flat], model.time[flat], centres, model.bones.parents)
     if settings.weight_joints and len(model.bones) > 1:
         pairs, joints = neighbours(centres.detach())
         placed = transform(transforms[:, pairs.reshape(-1)], joints[None].repeat_interleave(2, 1)[..., None, :])
         ends = placed.reshape(len(flat), -1, 2, 3)
         gap = torch.sqrt((ends[:, :, 0] - ends[:, :, 1]).square().sum(-1) + 1e-6)
-        slip = torch.sqrt(shift[:, 1:].square().sum(-1) + 1e-6)
+        slip = torch.sqrt(own[:, 1:, 3:].square().sum(-1) + 1e-6)
         terms["joints"] = settings.weight_joints * (0.3 * gap.mean() + slip.mean())
+    if settings.weight_rest:
+        # Depth is what a silhouette tells least: of two motions that explain it, the smaller one.
+        size = own[..., :3].square().sum(-1).mean() + own[:, 0].square().sum(-1).mean()
+        terms["rest"] = settings.weight_rest * size
     if settings.weight_motion:
         posed = (transforms[..., :3, :3] @ centres[..., None]).squeeze(-1) + transforms[..., :3, 3]
         p = posed.reshape(*triple.shape, -1, 3)

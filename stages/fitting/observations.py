@@ -112,10 +112,11 @@ class ObservationBuilder:
             valid = (other >= 0) & (other < len(frame))
             valid &= video[other.clamp(0, len(frame) - 1)] == video
             partner[step] = torch.where(valid, other, torch.full_like(other, -1))
+        counts = torch.tensor(np.array(self._frames["count"]))
         return Observations(
             video_idx=video,
             frame_weight=torch.tensor(np.array(self._frames["weight"])),
-            offsets=torch.cat([torch.zeros(1, dtype=torch.int64), torch.tensor(np.array(self._frames["count"])).cumsum(0)]),
+            offsets=torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]),
             xy=rows["xy"],
             rgb=rows["rgb"],
             mask=rows["mask"],

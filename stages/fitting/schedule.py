@@ -72,8 +72,10 @@ class PhaseSettings:
     """Second differences of the signed distance near the surface."""
     weight_bone_location: float = 0.1
     """Bones lie where the surface is (Sinkhorn divergence)."""
-    weight_joints: float = 0.3
+    weight_joints: float = 0.1
     """Neighbouring bones agree about the place where they meet."""
+    weight_rest: float = 0.03
+    """Size of the bones' own turns: of two motions that explain the pictures, the smaller one."""
     weight_motion: float = 0.02
     """Acceleration of bones between frames."""
     weight_root: float = 0.5
@@ -85,8 +87,8 @@ class PhaseSettings:
 
     delta_from: float = 2.0
     """Share of the phase from which skinning is corrected by a network; above 1 = never."""
-    reinitialise_bones_at: float = 2.0
-    """Share of the phase at which bones are placed anew on the current shape, keeping the motion; above 1 = never."""
+    renew_at: float = 2.0
+    """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     update_bounds_every: int = 200
     """Steps between updates of the surface, each frame's near and far planes, and the matching grid's bounds."""
 

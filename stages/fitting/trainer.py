@@ -14,6 +14,7 @@ from torch import Tensor
 from stages.fitting.batches import draw, step_generator
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
+from stages.fitting.renew import renew_bones, renew_bounds
 from stages.fitting.schedule import PhaseSettings, beta_at, rate_at
 from stages.fitting.surface import frame_boxes, surface_points
 from stages.model.banmo import Banmo
@@ -94,6 +95,8 @@ class Trainer:
         s, model = self.settings, self.model
         if self.step_idx and self.step_idx % s.update_bounds_every == 0:
             self.refresh()
+        if self.step_idx and self.step_idx == round(s.renew_at * s.iterations):
+            self._renew()
         if self.progress >= s.delta_from:
             model.use_delta = True
         generator = step_generator(s.seed, self.step_idx)
@@ -116,6 +119,16 @@ class Trainer:
         values = {name: float(value.detach()) for name, value in terms.items()}
         values["total"] = float(total.detach())
         return values
+
+    def _renew(self) -> None:
+        """Bones and box anew on the shape as it is now; the optimiser starts afresh, as the parameters are new."""
+        self.refresh()
+        if len(self.model.surface) < 100:
+            return
+        renew_bounds(self.model, margin=0.2)
+        renew_bones(self.model, self.settings.seed + self.step_idx)
+        self.refresh()
+        self.optimiser = self._optimiser()
 
     # ------------------------------------------------------------------------------------------ state
 

@@ -54,8 +54,8 @@ class FrameState(NamedTuple):
 
     transforms: Tensor
     """J (F, B, 4, 4), canonical to object space."""
-    shift: Tensor
-    """Each bone's own shift against its parent (F, B, 3)."""
+    own: Tensor
+    """Each bone's own rotation vector and shift against its parent (F, B, 6)."""
     inverse: Tensor
     """J^-1 (F, B, 4, 4)."""
     posed_coefficients: Tensor
@@ -139,13 +139,13 @@ class Banmo(nn.Module):
 
     def state_at(self, video_idx: Tensor, time: Tensor, base: Tensor) -> FrameState:
         """Frame state at normalised `time` (F,) of videos (F,), with initial root poses `base` (F, 4, 4)."""
-        transforms, shift, code = self.body(video_idx, time, self.bones.centres, self.bones.parents)
+        transforms, own, code = self.body(video_idx, time, self.bones.centres, self.bones.parents)
         rest = score_coefficients(self.bones.centres, self.bones.orientations, self.bones.log_scales)[None]
         centres = (transforms[..., :3, :3] @ self.bones.centres[..., None]).squeeze(-1) + transforms[..., :3, 3]
         posed = score_coefficients(centres, transforms[..., :3, :3] @ self.bones.orientations, self.bones.log_scales)
         return FrameState(
             transforms=transforms,
-            shift=shift,
+            own=own,
             inverse=invert_rigid(transforms),
             posed_coefficients=posed,
             rest_coefficients=rest,

@@ -82,13 +82,13 @@ class BodyPose(nn.Module):
     def forward(
         self, video_idx: Tensor, time: Tensor, centres: Tensor, parents: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """J (N, B, 4, 4) at `time` (N,), shifts (N, B, 3) and codes (N, C) of bones at `centres` (B, 3)."""
+        """J (N, B, 4, 4) at `time` (N,), own turns and shifts (N, B, 6), and codes (N, C); `centres` (B, 3)."""
         code = self.code(video_idx, time)
         vectors, shift = self.head(code)
         rotation = so3_exp(vectors)
         joints = (centres + centres[parents]) / 2
         local = rigid(rotation, joints - (rotation @ joints[..., None]).squeeze(-1) + shift)
-        return chain(local, parents), shift, code
+        return chain(local, parents), torch.cat([vectors, shift], -1), code
 
 
 def chain(local: Tensor, parents: Tensor) -> Tensor:

@@ -1,0 +1,68 @@
+"""New bones and a new box for a shape that has changed, with the motion kept (paper: supplement; reference: discarded).
+
+Bones are placed where the shape is at the start, before limbs have grown. Later they are placed anew on the current
+surface, and their motion is fitted to the motion that the old ones gave it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from stages.fitting.batches import step_generator
+from stages.fitting.initialise import place_bones
+from stages.model.banmo import Banmo
+from stages.model.fields import GridField
+from stages.model.skeleton import Bones
+
+
+def change_bones(model: Banmo, bones: Bones, points: Tensor, seed: int, steps: int = 200) -> float:
+    """Give the model new bones (as many as before), fitted to the motion of the old ones at `points` (N, 3).
+
+    Returns the root mean square difference of the two motions over all kept frames (units).
+    """
+    every = torch.arange(len(model.time))
+    sample = points[torch.randperm(len(points), generator=step_generator(seed, 0, rank=3))[:400]]
+
+    def warp(index: Tensor, some: Tensor) -> Tensor:
+        return model.forward_points(model.frames(index), some[None].expand(len(index), -1, -1))
+
+    with torch.no_grad():
+        target = torch.cat([warp(chunk, sample) for chunk in every.split(64)])
+        model.bones.load_state_dict(bones.state_dict())
+    for parameter in model.body.parameters():
+        parameter.requires_grad_(True)
+    optimiser = torch.optim.Adam(model.body.parameters(), lr=3e-3)
+    for step in range(steps):
+        generator = step_generator(seed, step, rank=5)
+        index = torch.randint(len(every), (48,), generator=generator)
+        pick = torch.randint(len(sample), (200,), generator=generator)
+        error = (warp(index, sample[pick]) - target[index][:, pick]).square().sum(-1).mean()
+        optimiser.zero_grad(set_to_none=True)
+        error.backward()
+        for group in optimiser.param_groups:
+            group["lr"] = 3e-3 * (1 - 0.9 * step / steps)
+        optimiser.step()
+    optimiser.zero_grad(set_to_none=True)
+    with torch.no_grad():
+        moved = torch.cat([warp(chunk, sample) for chunk in every.split(64)])
+    return float((moved - target).square().sum(-1).mean().sqrt())
+
+
+def renew_bones(model: Banmo, seed: int) -> float:
+    """Place the bones anew on ``model.surface``; returns what :func:`change_bones` does."""
+    return change_bones(model, place_bones(model.surface, len(model.bones), seed), model.surface, seed)
+
+
+def renew_bounds(model: Banmo, margin: float) -> bool:
+    """Fit the canonical box to ``model.surface`` plus `margin` (units); returns whether it changed.
+
+    Grids are resampled; networks only take the new box as bounds of matching and extraction.
+    """
+    if not isinstance(model.field, GridField):
+        return False
+    bounds = torch.stack([model.surface.amin(0) - margin, model.surface.amax(0) + margin])
+    if float((bounds - model.field.bounds).abs().max()) < 2 * model.field.voxel:
+        return False
+    model.field = model.field.resized(bounds)
+    return True
