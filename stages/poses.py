@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from pipeline import BadInput, Folder, Given, Resources, Run, Scene, stage
 from stages import formats
 from stages.registration.answer import Answer, Provider, Subject
 from stages.registration.combine import combine
-from stages.registration.cues import CROP_MARGIN, Cues, crop_frame
+from stages.registration.cues import CROP_MARGIN, Cues, crop_embedding, crop_frame, principal_directions
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
 from stages.registration.placing import (
     default_intrinsics,
@@ -29,6 +30,9 @@ from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
 CROP_PX = 48
+EMBEDDING_CHANNELS = 4
+APPEARANCE_ONLY = "builtin-appearance"
+"""What features.json calls an embedding made of colours and edges, which the search sees anyway."""
 LOW_TRUST = 0.5
 GIVEN = ".poses.json"
 PROVIDERS: dict[str, Provider] = {"search": search, "colmap": structure_from_motion, "upright": upright}
@@ -77,7 +81,10 @@ def poses(
     tried: list[dict[str, object]] = []
     answers: dict[str, Answer] = {}
     if asked:
-        subjects = [_subject(clips[n], masks[n], flow[n], settings, tracks.get(n), n, run) for n in clips]
+        basis = _embedding_basis(features)
+        subjects = [
+            _subject(n, clips[n], masks[n], flow[n], features[n], basis, settings, tracks.get(n), run) for n in clips
+        ]
         answers, tried = _ask(subjects, asked, settings, run)
         tracks |= {s.name: _track(s, answers[s.name]) for s in subjects if s.name in answers}
     for name, clip in clips.items():
@@ -111,13 +118,28 @@ def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
     )
 
 
+def _embedding_basis(features: dict[str, Folder]) -> np.ndarray | None:
+    """Main directions (16, K) of the collection's embeddings; None where they only restate the colours."""
+    samples = []
+    for folder in features.values():
+        if formats.read_json(folder / "features.json").get("network") == APPEARANCE_ONLY:
+            return None
+        maps, _ = formats.read_features(folder.path)
+        some = np.asarray(maps[:: max(1, len(maps) // 10), ::3, ::3], np.float32).reshape(-1, maps.shape[-1])
+        samples.append(some[np.abs(some).sum(axis=1) > 0])
+    together = np.concatenate(samples)
+    return principal_directions(together, EMBEDDING_CHANNELS) if len(together) > 100 else None
+
+
 def _subject(
+    name: str,
     clip: formats.Clip,
     masks: Folder,
     flow: Folder,
+    features: Folder,
+    basis: np.ndarray | None,
     settings: PosesSettings,
     track: formats.PoseTrack | None,
-    name: str,
     run: Run,
 ) -> Subject:
     """Read one clip into small crops; only one full frame is in memory at a time."""
@@ -136,6 +158,10 @@ def _subject(
         motion = formats.read_flow(path) if path.exists() else None
         parts.append(crop_frame(clip.image(i), probability[i], motion, centre[i], half[i], CROP_PX))
     mask, colour, flow_px, confidence = (np.stack(part) for part in zip(*parts, strict=True))
+    if basis is not None:
+        maps, crops = formats.read_features(features.path)
+        extra = [crop_embedding(maps[i], crops[i], basis, centre[i], half[i], CROP_PX) for i in range(len(clip))]
+        colour = np.concatenate([colour, np.stack(extra) * (mask[..., None] > 0.05)], -1)
     edge = np.array([clip.width, clip.height, clip.width, clip.height]) - boxes
     cut = (boxes[:, :2] <= 1).any(axis=1) | (edge[:, 2:] <= 1).any(axis=1)
     cues = Cues(mask, colour, flow_px, confidence, centre, half, boxes, known, cut, step)
@@ -157,6 +183,7 @@ def _ask(
     names = list(PROVIDERS) if settings.provider == "auto" else [settings.provider, "upright"]
     tried: list[dict[str, object]] = []
     answers: list[dict[str, Answer]] = []
+    torch.set_num_threads(max(1, run.threads))
 
     def tell(done: int, total: int, label: str) -> None:
         run.tick(done, total, label=label)

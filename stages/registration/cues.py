@@ -18,7 +18,7 @@ class Cues:
     """
 
     mask: np.ndarray  # (T, S, S) float32, foreground probability
-    colour: np.ndarray  # (T, S, S, 3) float32, 0..1, zero off the object
+    colour: np.ndarray  # (T, S, S, 3 or more) float32: RGB in 0..1, then embeddings if any; zero off the object
     flow_px: np.ndarray  # (T, S, S, 2) float32, full-image pixels to the frame `flow_step` later; zero at the end
     flow_confidence: np.ndarray  # (T, S, S) float32; zero at the end
     centre_px: np.ndarray  # (T, 2) float64
@@ -84,6 +84,30 @@ def crop_frame(
     motion = square_crop(flow[0] * trust[..., None], centre, half, size)
     motion = np.where(confidence[..., None] > 0.05, motion / np.maximum(confidence[..., None], 0.05), 0.0)
     return small, colour, motion, confidence
+
+
+def crop_embedding(
+    embedding: np.ndarray, box: np.ndarray, basis: np.ndarray, centre: np.ndarray, half: float, size: int
+) -> np.ndarray:
+    """A map (M, M, D), zero off the object, that covers `box` (x0, y0, x1, y1 px), cut as :func:`crop_frame` cuts.
+
+    Its channels are projected on `basis` (D, K); returns (size, size, K) float32, averaged over the object only.
+    """
+    cells = len(embedding) / (box[2] - box[0])
+    centre, half = (centre - box[:2]) * cells, half * cells
+    embedding = embedding.astype(np.float32)
+    inside = (np.abs(embedding).sum(-1) > 0).astype(np.float32)
+    share = square_crop(inside, centre, half, size)
+    values = square_crop((embedding @ basis).astype(np.float32), centre, half, size).reshape(size, size, -1)
+    return np.where(share[..., None] > 0.05, values / np.maximum(share[..., None], 0.05), 0.0)
+
+
+def principal_directions(samples: np.ndarray, count: int) -> np.ndarray:
+    """Orthonormal directions (D, count) in which (N, D) samples vary most; signs fixed, so that runs agree."""
+    centred = samples.astype(np.float64) - samples.mean(axis=0, dtype=np.float64)
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    directions = vectors[:, ::-1][:, :count]
+    return directions * np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
 
 
 def inflate(masks: np.ndarray, iterations: int = 200) -> np.ndarray:

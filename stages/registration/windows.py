@@ -26,8 +26,10 @@ class Windows:
         self.mask = torch.as_tensor(some.mask)
         colour = torch.as_tensor(some.colour)
         total = self.mask.sum().clamp(min=1.0)
-        brightness = ((colour * self.mask[..., None]).sum((0, 1, 2)) / total).mean()
-        self.colour = colour / brightness.clamp(min=1e-3)  # exposure differs from clip to clip
+        brightness = ((colour[..., :3] * self.mask[..., None]).sum((0, 1, 2)) / total).mean()
+        scale = torch.ones(colour.shape[-1])
+        scale[:3] = brightness.clamp(min=1e-3)  # exposure differs from clip to clip
+        self.colour = colour / scale
         self.weight = torch.as_tensor(np.where(some.cut, 0.3, 1.0) * some.known, dtype=torch.float32)
         self.centre, self.area = centre_and_area(self.mask)
         self.half = half = torch.as_tensor(some.half_px, dtype=torch.float32)
@@ -54,10 +56,13 @@ class Windows:
 
 
 def whiten_together(windows: list[Windows]) -> None:
-    """Bring the colours of a collection to zero mean and unit total variance."""
+    """Bring the colours of a collection to zero mean and unit total variance, and likewise its embeddings if any."""
     colours = torch.cat([w.colour[w.mask > 0.5] for w in windows])
     mean = colours.mean(0)
-    deviation = (colours - mean).pow(2).sum(1).mean().sqrt().clamp(min=1e-3)
+    variance = (colours - mean).pow(2).mean(0)
+    deviation = torch.ones_like(variance)
+    for group in (slice(0, 3), slice(3, None)):
+        deviation[group] = variance[group].sum().sqrt().clamp(min=1e-3)
     for w in windows:
         w.whiten(mean, deviation)
 

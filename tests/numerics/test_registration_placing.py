@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.registration import given as given_poses
-from stages.registration.cues import inflate, square_crop
+from stages.registration.cues import crop_embedding, inflate, principal_directions, square_crop
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
 from stages.registration.placing import (
     default_intrinsics,
@@ -181,7 +181,7 @@ def test_a_disc_inflates_to_a_ball() -> None:
     size, radius = 64, 20.0
     axis = np.arange(size) + 0.5 - size / 2
     distance2 = axis[None] ** 2 + axis[:, None] ** 2
-    height = inflate((distance2 < radius**2)[None].astype(np.float32), 3000)[0]
+    height = inflate((distance2 < radius**2)[None].astype(np.float32))[0]
     ball = np.sqrt(np.maximum(radius**2 - distance2, 0)) * np.sqrt(3 / 4)
     assert np.abs(height - ball)[distance2 < (radius - 3) ** 2].max() < 0.08 * radius
     assert height[distance2 > (radius + 1) ** 2].max() == 0
@@ -192,6 +192,30 @@ def test_crops_keep_places_and_means() -> None:
     crop = square_crop(column + 1000 * row, np.array([50.0, 40.0]), 24.0, 12)
     middle = 4.0 * (np.arange(12) + 0.5) - 24
     assert crop == pytest.approx((50 + middle)[None] + 1000 * (40 + middle)[:, None], abs=0.5)
+
+
+def test_embeddings_are_cut_where_the_picture_is() -> None:
+    cells, box = 28, np.array([20.0, 10.0, 76.0, 66.0])  # two pixels a cell
+    middle = (np.arange(cells) + 0.5) * 2
+    place = np.stack(np.broadcast_arrays((20 + middle)[None], (10 + middle)[:, None], 1.0), -1)
+    place[:, 20:] = 0  # off the object
+    basis = np.eye(3)[:, :2]
+    crop = crop_embedding(place, box, basis, np.array([40.0, 36.0]), 12.0, 12)
+    x = 40 + 2.0 * (np.arange(12) + 0.5) - 12
+    on = x < 58
+    assert crop[:, on, 0] == pytest.approx(np.broadcast_to(x[on], (12, on.sum())), abs=0.3)
+    assert crop[:, on, 1] == pytest.approx(np.broadcast_to((x - 4)[:, None], (12, on.sum())), abs=0.3)
+    outside = crop_embedding(place, box, basis, np.array([70.0, 36.0]), 6.0, 12)
+    assert not outside[:, 2:].any()
+
+
+def test_principal_directions_are_the_ones_put_in() -> None:
+    random = np.random.default_rng(0)
+    axes = np.linalg.qr(random.normal(size=(5, 5)))[0]
+    samples = random.normal(size=(4000, 5)) * [5, 3, 0.1, 0.1, 0.1] @ axes.T + 7
+    found = principal_directions(samples, 2)
+    assert np.abs((found * axes[:, :2]).sum(0)) == pytest.approx(np.ones(2), abs=0.01)
+    assert found == pytest.approx(principal_directions(samples[::-1], 2))  # signs and all
 
 
 # ------------------------------------------------------------------------------------------ tracking, windows, views

@@ -12,7 +12,17 @@ import pytest
 
 from pipeline import BadInput, Folder, Given, Run
 from stages import poses as stage_module
-from stages.formats import Clip, flow_path, read_clip, read_json, read_poses, write_clip_info, write_flow, write_image
+from stages.formats import (
+    Clip,
+    flow_path,
+    read_clip,
+    read_json,
+    read_poses,
+    write_clip_info,
+    write_flow,
+    write_image,
+    write_json,
+)
 from stages.poses import GIVEN, PosesSettings, _check, _sheet, poses
 from stages.registration.answer import Answer, Subject, Tell
 from stages.registration.placing import default_intrinsics, transforms, view_rotation
@@ -34,6 +44,7 @@ def write_clip(
     for folder in folders.values():
         folder.mkdir(parents=True)
     (folders["flow"] / "fw-01").mkdir()
+    write_json(folders["features"] / "features.json", {"network": "builtin-appearance", "frames": []})
     clip = Clip(folders["frames"], SIDE, SIDE, kept, np.arange(len(azimuth)) / 20)
     write_clip_info(clip, clip.root, {"source_width": 2 * SIDE, "source_height": 2 * SIDE})
     here = np.stack(np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5), -1)
