@@ -105,7 +105,7 @@ class RefineSettings(PhaseSettings):
     """Frame steps of the optical flow that are used, both ways."""
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
 def fit(
     frames: dict[str, Folder],
     masks: dict[str, Folder],
@@ -130,7 +130,7 @@ def fit(
     _run_phase(model, collection, settings, checkpoints, out, run, "fitting")
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
 def correct(
     fit: Folder,
     frames: dict[str, Folder],
@@ -146,7 +146,7 @@ def correct(
     _continue(fit, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all"))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
 def refine(
     correct: Folder,
     frames: dict[str, Folder],
@@ -222,6 +222,7 @@ def _run_phase(
     label: str,
 ) -> None:
     """Train from the last checkpoint to the end, and write the phase's folder."""
+    model.to(run.device)
     trainer = Trainer(model, collection.observations, settings)
     history: list[dict[str, float]] = []
     saved = checkpoints.latest()
@@ -244,7 +245,7 @@ def _run_phase(
                 raise
             run.warn(f"{error}; continued from step {saved.step} with half the step size")
             scale = trainer.rate_scale / 2
-            model = Banmo.restore(saved.model_tensors(), saved.description)
+            model = Banmo.restore(saved.model_tensors(), saved.description).to(run.device)
             trainer = Trainer(model, collection.observations, settings)
             trainer.restore(saved.tensors)
             trainer.rate_scale, history = scale, saved.history
@@ -254,8 +255,9 @@ def _run_phase(
         run.tick(trainer.step_idx, settings.iterations, label, loss=values["total"])
         if trainer.step_idx % _CHECKPOINT_STEPS == 0 and not trainer.done:
             checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
-            _write_preview(model, collection, checkpoints.root / "preview.png")
-    _write_folder(model, collection, history, out)
+            if run.device == "cpu":
+                _write_preview(model, collection, checkpoints.root / "preview.png")
+    _write_folder(model.to("cpu"), collection, history, out)
     for name, value in history[-1].items() if history else ():
         if name != "step":
             run.metric(f"loss_{name}", value)

@@ -24,6 +24,10 @@ class Batch(NamedTuple):
     flow_confidence: Tensor  # (F, P) in 0..1; zero where there is none
     features: Tensor | None  # (F, P, 16) unit length, or zero off the object
 
+    def to(self, device: torch.device) -> Batch:
+        """The same batch on another device."""
+        return Batch(*(None if x is None else x.to(device, non_blocking=True) for x in self))
+
 
 def step_generator(seed: int, step: int, rank: int = 0) -> torch.Generator:
     """The source of every random draw of one step."""

@@ -77,25 +77,13 @@ def rigid_hull(observations: Observations, poses: Tensor, intrinsics: Tensor, vo
     return Hull(nodes, cube, solid, level)
 
 
-def shell(body: Hull) -> Tensor:
-    """Surface voxels (N, 3) of a hull."""
-    solid = body.solid
-    inner = torch.zeros_like(solid)
-    inner[1:-1, 1:-1, 1:-1] = (
-        solid[1:-1, 1:-1, 1:-1]
-        & solid[2:, 1:-1, 1:-1] & solid[:-2, 1:-1, 1:-1]
-        & solid[1:-1, 2:, 1:-1] & solid[1:-1, :-2, 1:-1]
-        & solid[1:-1, 1:-1, 2:] & solid[1:-1, 1:-1, :-2]
-    )  # fmt: skip
-    return body.nodes[solid & ~inner]
-
-
 def place_bones(points: Tensor, count: int, seed: int) -> Bones:
     """Bones among surface points (N, 3): farthest points first, then a few rounds of k-means.
 
     Farthest points reach the ends of thin limbs, which k-means alone, ruled by mass, leaves without a bone. Each
     bone is as wide as 0.45 of the way to its neighbours.
     """
+    points = points.cpu()
     data = points.numpy().astype(np.float64)
     count = min(count, len(data))
     rng = np.random.default_rng(seed)

@@ -23,10 +23,10 @@ def sample_volume(model: Banmo, resolution: int) -> tuple[np.ndarray, Tensor, Te
     y, z = torch.meshgrid(axes[1], axes[2], indexing="ij")
     slabs = []
     for x in axes[0]:
-        points = torch.stack([x.expand_as(y), y, z], -1).reshape(-1, 3)
-        slabs.append(model.field.sdf(prepared, points).reshape(y.shape))
+        points = torch.stack([x.expand_as(y), y, z], -1).reshape(-1, 3).to(low.device)
+        slabs.append(model.field.sdf(prepared, points).reshape(y.shape).cpu())
     spacing = torch.tensor([float(a[1] - a[0]) for a in axes])
-    return torch.stack(slabs).numpy(), low.clone(), spacing
+    return torch.stack(slabs).numpy(), low.cpu().clone(), spacing
 
 
 def surface_points(model: Banmo, resolution: int = 64, most: int = 2048) -> Tensor:

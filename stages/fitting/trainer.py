@@ -6,8 +6,6 @@ Resuming is exact: all randomness comes from (seed, step), and everything a step
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -38,6 +36,11 @@ class Trainer:
         model.use_delta = model.use_delta or settings.delta_from <= 0
         self.refresh()
         self.optimiser = self._optimiser()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model lives; observations stay in main memory."""
+        return self.model.base_poses.device
 
     # ------------------------------------------------------------------------------------------ parameters
 
@@ -84,7 +87,7 @@ class Trainer:
         """Extract the surface anew and each frame's box around it: near and far planes, matching bounds."""
         points = surface_points(self.model)
         if len(points) >= 100:
-            self.model.surface = points
+            self.model.surface = points.to(self.device)
         self.boxes = frame_boxes(self.model)
 
     def step(self) -> dict[str, float]:
@@ -100,7 +103,7 @@ class Trainer:
         if self.progress >= s.delta_from:
             model.use_delta = True
         generator = step_generator(s.seed, self.step_idx)
-        batch = draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator)
+        batch = draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator).to(self.device)
         beta = max(beta_at(s, self.progress), model.beta_floor)
         terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator)
         total = torch.stack(list(terms.values())).sum()
@@ -148,9 +151,9 @@ class Trainer:
     def restore(self, state: dict[str, Tensor]) -> None:
         """Continue from what :meth:`state` gave, bit for bit."""
         tensors = {k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")}
-        self.model.surface = torch.zeros_like(tensors["surface"])
+        self.model.surface = torch.zeros_like(tensors["surface"], device=self.device)
         self.model.load_state_dict(tensors)
-        self.boxes = state["boxes"].clone()
+        self.boxes = state["boxes"].to(self.device, copy=True)
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])
         self.rate_scale = float(state["rate_scale"][0])
@@ -158,10 +161,7 @@ class Trainer:
         for g, group in enumerate(self.optimiser.param_groups):
             for p, parameter in enumerate(group["params"]):
                 prefix = f"adam.{g}.{p}."
-                moments = {k.removeprefix(prefix): v.clone() for k, v in state.items() if k.startswith(prefix)}
-                if moments:
-                    self.optimiser.state[parameter] = moments
-
-    def finite(self) -> bool:
-        """Whether every parameter is finite."""
-        return all(math.isfinite(float(p.detach().abs().sum())) for p in self.model.parameters())
+                for key, value in state.items():
+                    if key.startswith(prefix):  # moments lie beside their parameter, Adam's step count on the CPU
+                        place = parameter.device if value.shape == parameter.shape else torch.device("cpu")
+                        self.optimiser.state[parameter][key.removeprefix(prefix)] = value.to(place, copy=True)

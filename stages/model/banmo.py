@@ -109,9 +109,11 @@ class Banmo(nn.Module):
         self.starts = [0]
         for v in videos:
             self.starts.append(self.starts[-1] + len(v.time_s))
-        self.video_idx = torch.cat([torch.full((len(v.time_s),), i) for i, v in enumerate(videos)])
+        index = torch.cat([torch.full((len(v.time_s),), i) for i, v in enumerate(videos)])
+        self.register_buffer("video_idx", index, persistent=False)
         self.half_span_s = max(max(v.time_s[-1] - v.time_s[0] for v in videos) / 2, 1e-3)
-        self.time = torch.cat([self.normalised_time(i, torch.tensor(v.time_s)) for i, v in enumerate(videos)])
+        time = torch.cat([self.normalised_time(i, torch.tensor(v.time_s)) for i, v in enumerate(videos)])
+        self.register_buffer("time", time, persistent=False)
 
     # ------------------------------------------------------------------------------------------ frames
 
@@ -158,9 +160,7 @@ class Banmo(nn.Module):
     def frames(self, frame_idx: Tensor) -> FrameState:
         """Frame state of kept frames `frame_idx` (F,), counted over the collection."""
         index = frame_idx.to(self.time.device)
-        return self.state_at(
-            self.video_idx[index].to(frame_idx.device), self.time[index].to(frame_idx.device), self.base_poses[index]
-        )
+        return self.state_at(self.video_idx[index], self.time[index], self.base_poses[index])
 
     # ------------------------------------------------------------------------------------------ warps
 
