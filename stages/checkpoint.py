@@ -70,6 +70,7 @@ class Checkpoints:
 
     def latest(self) -> Saved | None:
         """The newest checkpoint that is whole, or None."""
+        from safetensors import SafetensorError
         from safetensors.torch import load
 
         for folder in self._steps():
@@ -79,6 +80,6 @@ class Checkpoints:
                 if hashlib.sha256(data).hexdigest() != facts["sha256"]:
                     continue
                 return Saved(int(facts["step"]), load(data), facts["description"], list(facts["history"]))
-            except (OSError, ValueError, KeyError):
+            except (OSError, ValueError, KeyError, SafetensorError):
                 continue
         return None
