@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -118,7 +120,7 @@ def path_length(distance: torch.Tensor, parents: list[int], a: int, b: int) -> f
     left, right = up(a), up(b)
     shared = next(n for n in left if n in right)
     steps = left[: left.index(shared) + 1], right[: right.index(shared) + 1]
-    return sum(float(distance[p, q]) for s in steps for p, q in zip(s, s[1:], strict=False))
+    return sum(float(distance[p, q]) for s in steps for p, q in pairwise(s))
 
 
 @given(st.integers(1, 12), st.integers(0, 10_000))
