@@ -76,7 +76,7 @@ def run_banmo(
     code: Path | None = None,
     python: tuple[str, ...] = (),
     before: tuple[str, ...] = (),
-    timeout_s: float = 600.0,
+    timeout_s: float = 3000.0,
 ) -> Outcome:
     """Run ``banmo`` with the code in `code`, as a user would; `python` are options of the interpreter."""
     code = code or snapshot()
