@@ -119,7 +119,7 @@ class Banmo(nn.Module):
 
     @property
     def beta_floor(self) -> float:
-        """Smallest useful width of the density, half a voxel."""
+        """Smallest useful width of the density, a quarter of a voxel."""
         return 0.25 * self.architecture.voxel
 
     def normalised_time(self, video_idx: int, time_s: Tensor) -> Tensor:
