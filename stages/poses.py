@@ -171,9 +171,10 @@ def _subject(
 
     if track is None:
         intrinsics = default_intrinsics(clip.width, clip.height, settings.focal_px or clip.focal_hint_px)
-        return Subject(name, cues, intrinsics, None, frame)
+        return Subject(name, cues, intrinsics, frame=frame)
     turned = ray_rotation(centre, track.intrinsics).transpose(0, 2, 1)
-    return Subject(name, cues, track.intrinsics, turned @ track.object_to_camera[:, :3, :3], frame)
+    rotation, depth = turned @ track.object_to_camera[:, :3, :3], track.object_to_camera[:, 2, 3]
+    return Subject(name, cues, track.intrinsics, rotation, depth, frame)
 
 
 def _ask(

@@ -19,6 +19,7 @@ class Subject:
     cues: Cues
     intrinsics: np.ndarray  # (3, 3) pixels
     rotation: np.ndarray | None = None  # (T, 3, 3) object to crop camera, known exactly
+    depth: np.ndarray | None = None  # (T,) of the object's origin, in the user's units, where the rotation is known
     frame: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
     """Full picture (H, W, 3) and mask (H, W) uint8 of one kept frame, for providers that need more than crops."""
 

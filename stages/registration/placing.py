@@ -60,6 +60,14 @@ def ray_rotation(centre_px: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     return out
 
 
+def upright_frame(up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) from a frame in which `up` (3,) points upwards to one whose y axis does."""
+    y = up / np.linalg.norm(up)
+    z = np.cross([1.0, 0, 0] if abs(y[0]) < 0.9 else [0, 0, 1.0], y)
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])
+
+
 def fill_gaps(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Linear interpolation of (T, ...) values over frames that are not `known`; constant beyond the ends."""
     if known.all() or not known.any():

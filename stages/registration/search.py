@@ -7,14 +7,14 @@ on; clips are registered anew to the volume of the others; mirrored hypotheses a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stages.registration.answer import Answer, Subject, Tell
 from stages.registration.cues import CROP_MARGIN
 from stages.registration.model import Hypothesis, Sequence, Weights
-from stages.registration.placing import smooth, view_angles, view_rotation
+from stages.registration.placing import smooth, upright_frame, view_angles, view_rotation
 from stages.registration.tracking import posterior_angles
 from stages.registration.turning import expected_turns
 from stages.registration.volume import EXTENT, ViewBank
@@ -46,6 +46,8 @@ TELLING_MARGIN = 0.09
 
 def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effort()) -> dict[str, Answer]:
     """Answers for every clip whose poses are not given."""
+    world = given_upright(subjects)
+    subjects = [s if s.rotation is None else replace(s, rotation=s.rotation @ world.T) for s in subjects]
     chosen = choose_frames([len(s.cues) for s in subjects], effort.frames)
     drifts = [expected_turns(s.cues) for s in subjects]
     bank = ViewBank(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, COARSE_ELEVATION, effort.coarse_px)
@@ -64,7 +66,34 @@ def search(subjects: list[Subject], seed: int, tell: Tell, effort: Effort = Effo
     rivals = [*kept, reregister(kept[0], clock), mirrored(kept[0], clock)]
     rivals.sort(key=lambda h: h.evidence)
     best = finer(rivals[0], subjects, chosen, drifts, effort, clock)
-    return {s.name: _answer(s, k, best, rivals, chosen[k]) for k, s in enumerate(subjects) if s.rotation is None}
+    scale = given_scale(subjects, best, chosen)
+    answers = {}
+    for k, s in enumerate(subjects):
+        if s.rotation is None:
+            answer = _answer(s, k, best, rivals, chosen[k])
+            answers[s.name] = replace(answer, rotation=answer.rotation @ world, extent=answer.extent * scale)
+    return answers
+
+
+def given_upright(subjects: list[Subject]) -> np.ndarray:
+    """Rotation (3, 3) from the object space of the given poses to an upright one; nothing if it is nearly upright."""
+    given = [s.rotation for s in subjects if s.rotation is not None]
+    if not given:
+        return np.eye(3)
+    up = -np.concatenate(given)[:, 1].mean(axis=0)
+    upright = up[1] > np.cos(np.radians(35.0)) * np.linalg.norm(up)
+    return np.eye(3) if upright or np.linalg.norm(up) < 0.1 else upright_frame(up)
+
+
+def given_scale(subjects: list[Subject], best: Hypothesis, chosen: list[np.ndarray]) -> float:
+    """The user's units over the search's (object about 2 long), from the clips whose poses are given; else 1."""
+    ratios = []
+    for k, s in enumerate(subjects):
+        if s.depth is not None:
+            focal = np.sqrt(s.intrinsics[0, 0] * s.intrinsics[1, 1])
+            units = s.depth[chosen[k]] * s.cues.half_px[chosen[k]] / focal  # the user's, in half a crop
+            ratios.append(units / best.units[k].numpy())
+    return float(np.median(np.concatenate(ratios))) if ratios else 1.0
 
 
 class _Clock:

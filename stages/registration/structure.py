@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from stages.registration.answer import Answer, Subject, Tell
-from stages.registration.placing import depth_from_size, ray_rotation
+from stages.registration.placing import depth_from_size, ray_rotation, upright_frame
 
 MOST_FRAMES = 96
 """Frames of all clips together: every pair is matched."""
@@ -36,7 +36,7 @@ def structure_from_motion(subjects: list[Subject], seed: int, tell: Tell) -> dic
         return {}
     poses, centre, size, error_px = model
     up = -np.mean([r[1] for clip in poses.values() for r, _ in clip.values()], axis=0)
-    world = _upright(up)
+    world = upright_frame(up)
     answers = {}
     for subject in usable:
         found = poses.get(subject.name, {})
@@ -118,14 +118,6 @@ def _write(subject: Subject, most: int, label: str, pictures: Path) -> tuple[lis
         names.append(name)
     k = subject.intrinsics * factor
     return names, f"{k[0, 0]},{k[1, 1]},{k[0, 2]},{k[1, 2]}"
-
-
-def _upright(up: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) from the model's frame to one whose y is `up`."""
-    y = up / np.linalg.norm(up)
-    z = np.cross([1.0, 0, 0] if abs(y[0]) < 0.9 else [0, 0, 1.0], y)
-    z /= np.linalg.norm(z)
-    return np.stack([np.cross(y, z), y, z])
 
 
 def _answer(

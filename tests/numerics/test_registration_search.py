@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from stages.registration.answer import Subject
 from stages.registration.cues import inflate
 from stages.registration.model import Hypothesis, Weights
-from stages.registration.placing import default_intrinsics, view_angles
+from stages.registration.placing import default_intrinsics, depth_from_size, view_angles
 from stages.registration.search import Effort, agreement, choose_frames, make_sequences, search, spread
 from stages.registration.sheets import draw_pose, pose_sheet
 from stages.registration.turning import expected_turns, row_turns, turn_rates
@@ -36,7 +38,9 @@ def after_one_turn(found: list[np.ndarray], truth: list[np.ndarray]) -> np.ndarr
 @pytest.mark.parametrize("step", [1, 2])
 def test_the_flow_of_a_ball_tells_its_turn(way: float, step: int) -> None:
     ball = (((0.0, 0.0, 0.0), 0.8, (0.6, 0.6, 0.6)),)  # far away, so that perspective adds little
-    cues, _ = clip_of(way * np.radians(3.0) * np.arange(6), elevation=0.0, distance=12.0, focal=5.0, step=step, balls=ball)
+    cues, _ = clip_of(
+        way * np.radians(3.0) * np.arange(6), elevation=0.0, distance=12.0, focal=5.0, step=step, balls=ball
+    )
     relief = inflate(cues.mask) * 2 / cues.mask.shape[1]
     rates, trust = turn_rates(cues, relief)
     assert np.degrees(rates[:, 1]) == pytest.approx(np.full(6, way * 3.0), rel=0.35)
@@ -89,14 +93,19 @@ def test_the_search_is_the_same_twice(beast_clips: tuple[list[Subject], list[np.
 
 def test_given_clips_anchor_the_others(beast_clips: tuple[list[Subject], list[np.ndarray]]) -> None:
     subjects, truth = beast_clips
+    # the user's own object space has z up and is in decimetres
+    own = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     anchored = [
-        Subject(s.name, s.cues, s.intrinsics, truth[i] if i != 1 else None) for i, s in enumerate(subjects)
+        replace(s, rotation=truth[i] @ own.T, depth=np.full(24, 32.0)) if i != 1 else s for i, s in enumerate(subjects)
     ]
-    answers = search(anchored, 0, quiet, Effort(starts=3, rounds=10, fine_rounds=3, frames=60, coarse_px=20, fine_px=20))
+    little = Effort(starts=3, rounds=10, fine_rounds=3, frames=60, coarse_px=20, fine_px=20)
+    answers = search(anchored, 0, quiet, little)
     assert list(answers) == ["clip-1"]
     # no common rotation to be removed: the answer is in the given clips' own object space
-    errors = np.degrees(Rotation.from_matrix(answers["clip-1"].rotation.transpose(0, 2, 1) @ truth[1]).magnitude())
-    assert errors.mean() < 25
+    found = answers["clip-1"].rotation.transpose(0, 2, 1) @ (truth[1] @ own.T)
+    assert np.degrees(Rotation.from_matrix(found).magnitude()).mean() < 25
+    depth = depth_from_size(subjects[1].cues.box_px, subjects[1].intrinsics, answers["clip-1"].extent)
+    assert np.median(depth) == pytest.approx(32.0, rel=0.15)
 
 
 def test_a_mirrored_hypothesis_explains_less(beast_clips: tuple[list[Subject], list[np.ndarray]]) -> None:

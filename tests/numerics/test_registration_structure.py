@@ -40,7 +40,7 @@ def test_structure_from_motion_recovers_a_rigid_turn() -> None:
         grey = np.where(mask, speckled(points), 0.4)[..., None]
         return np.round(255 * np.clip(0.6 * grey + 0.4 * picture, 0, 1)).astype(np.uint8), mask.astype(np.uint8) * 255
 
-    subject = Subject("a", cues, intrinsics, None, frame)
+    subject = Subject("a", cues, intrinsics, frame=frame)
     answer = structure_from_motion([subject], 0, quiet)["a"]
     found = ray_rotation(answer.origin_px, intrinsics) @ answer.rotation
     turn = common_rotation(truth[:, :3, :3], found, np.ones(count))
@@ -54,7 +54,7 @@ def test_structure_from_motion_recovers_a_rigid_turn() -> None:
 def test_a_featureless_clip_gets_no_answer() -> None:
     cues, _ = clip_of(np.linspace(0, 0.5, 4))
     blank = (np.full((96, 96, 3), 128, np.uint8), np.full((96, 96), 255, np.uint8))
-    subject = Subject("a", cues, default_intrinsics(96, 96), None, lambda i: blank)
+    subject = Subject("a", cues, default_intrinsics(96, 96), frame=lambda i: blank)
     assert structure_from_motion([subject], 0, quiet) == {}
     assert structure_from_motion([replace(subject, frame=None)], 0, quiet) == {}
 

@@ -42,7 +42,13 @@ def cast(pose: np.ndarray, intrinsics: np.ndarray, side: int, balls=BEAST) -> tu
 
 
 def clip_of(
-    azimuth: np.ndarray, elevation: float = 0.3, side: int = 96, distance: float = 3.2, focal: float = 1.3, step: int = 1, balls=BEAST
+    azimuth: np.ndarray,
+    elevation: float = 0.3,
+    side: int = 96,
+    distance: float = 3.2,
+    focal: float = 1.3,
+    step: int = 1,
+    balls=BEAST,
 ) -> tuple[Cues, np.ndarray]:
     """Cues of a clip with exact masks and flow, and its true object-to-camera transforms (T, 4, 4)."""
     intrinsics = default_intrinsics(side, side, focal * side)
