@@ -1,4 +1,4 @@
-"""flow: where each pixel of the object goes, forward and backward, at several distances in time.
+"""flow: where each pixel goes, forward and backward, at several distances in time.
 
 Who answers, first to last: `clip.flow/` beside the video (the same layout: `fw-01/00000.png` ... in KITTI's format, or
 `.npy`), the ONNX network that the settings name, DIS (OpenCV) on the object alone, long steps started from chained
@@ -24,7 +24,6 @@ from stages.formats import (
     read_clip,
     read_flow,
     read_json,
-    read_masks,
     write_flow,
     write_image,
     write_json,
@@ -36,10 +35,7 @@ from stages.perception.optical_flow import (
     FlowPair,
     Matcher,
     direct_pairs,
-    isolate,
-    place,
     round_trip_error,
-    shared_window,
 )
 from stages.perception.sampling import fit_size
 from stages.perception.sheets import flow_colours, pick, tile
@@ -53,8 +49,6 @@ class FlowSettings:
     """Distances in kept frames between which flow is computed."""
     quality: str = "medium"
     """Preset of DIS: ultrafast, fast, medium or fine; the smallest step always gets "fine" with medium."""
-    dilate: float = 0.02
-    """Flow is kept this far outside the mask, as a fraction of the longer side."""
     network: InputFile = NO_FILE
     """An ONNX file of two pictures in, flow out (the OpenCV zoo's RAFT as it is); empty for none."""
     network_contract: InputFile = NO_FILE
@@ -62,22 +56,20 @@ class FlowSettings:
 
 
 @stage(per=Video, version=1, given=(".flow",), needs=Resources(cpus=1))
-def flow(frames: Folder, masks: Folder, given: Given, settings: FlowSettings, out: Path, run: Run) -> None:
+def flow(frames: Folder, given: Given, settings: FlowSettings, out: Path, run: Run) -> None:
     """Flow with forward-backward confidence, KITTI's 16-bit PNG; `flow.json` with consistency figures a step."""
     cv2.setNumThreads(1)  # DIS gives other digits with other thread counts
     clip = read_clip(frames.path)
-    probability = read_masks(masks.path, clip)
-    near = _near_object(probability, settings.dilate)
     steps = _steps(settings, clip)
     folder = given.get(".flow")
     figures: dict[int, list[tuple[float, float]]] = {}
     if folder is not None:
         provider = "given"
-        _copy_given(folder, clip, near, out, figures, run)
+        _copy_given(folder, clip, out, figures, run)
     else:
-        provider, pairs = _provider(clip, probability, settings, steps, run)
+        provider, pairs = _provider(clip, settings, steps, run)
         for done, pair in enumerate(pairs):
-            _write_pair(pair, clip, near, out, figures)
+            _write_pair(pair, clip, out, figures)
             run.tick(done + 1, sum(len(clip) - s for s in steps), label="flow")
             if run.stop_requested:
                 run.interrupt()
@@ -106,34 +98,25 @@ def _steps(settings: FlowSettings, clip: Clip) -> tuple[int, ...]:
     return steps or (1,)
 
 
-def _near_object(masks: np.ndarray, dilate: float) -> np.ndarray:
-    """(T, H, W) bool: on the mask or a little outside."""
-    reach = max(1, round(dilate * max(masks.shape[1:])))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.stack([cv2.dilate(m, disc) > 127 for m in masks])
-
-
 def _provider(
-    clip: Clip, masks: np.ndarray, settings: FlowSettings, steps: tuple[int, ...], run: Run
+    clip: Clip, settings: FlowSettings, steps: tuple[int, ...], run: Run
 ) -> tuple[str, Iterator[FlowPair]]:
     if settings.network:
         network = FlowNetwork(Path(settings.network), settings.network_contract, device=run.device, threads=run.threads)
         run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
         images = clip.images()
         return network.path.name, direct_pairs(images, steps, network)
-    rows, columns = shared_window(masks > 127)
-    on = masks[:, rows, columns] > 127
-    grey = [cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY)[rows, columns] for i in range(len(clip))]
-    frames = np.stack([isolate(g, m) for g, m in zip(grey, on, strict=True)])
+    grey = np.stack([cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY) for i in range(len(clip))])
     matcher = Matcher(settings.quality)
-    chain = Chain(frames, on, matcher, Matcher("fine") if settings.quality == "medium" else matcher)
-    return f"dis-{settings.quality}", (place(pair, rows, columns, masks.shape[1:]) for pair in chain.pairs(steps))
+    chain = Chain(grey, matcher, Matcher("fine") if settings.quality == "medium" else matcher)
+    return f"dis-{settings.quality}", chain.pairs(steps)
 
 
-def _write_pair(
-    pair: FlowPair, clip: Clip, near: np.ndarray, out: Path, figures: dict[int, list[tuple[float, float]]]
-) -> None:
-    """Write both directions; note mean confidence and median round trip on the object."""
+def _write_pair(pair: FlowPair, clip: Clip, out: Path, figures: dict[int, list[tuple[float, float]]]) -> None:
+    """Write both directions; note mean confidence and median round trip.
+
+    Steps of 1/16 px and of 1/15 of confidence are finer than the matching is sure of, and halve the files.
+    """
     ways = (
         (pair.first_idx, pair.forward, pair.backward, pair.forward_confidence, False),
         (pair.second_idx, pair.backward, pair.forward, pair.backward_confidence, True),
@@ -141,11 +124,11 @@ def _write_pair(
     for frame_idx, there, back, sure, is_backward in ways:
         path = flow_path(out, pair.step, int(clip.source_idx[frame_idx]), is_backward)
         path.parent.mkdir(exist_ok=True)
-        on = near[frame_idx]
-        write_flow(path, there, np.where(on, sure, 0.0))
-        if on.any() and not is_backward:
-            trip = round_trip_error(there, back)[on]
-            figures.setdefault(pair.step, []).append((float(sure[on].mean()), float(np.median(trip))))
+        coarse = np.where(sure < 0.1, 0.0, np.ceil(sure * 15) / 15)
+        write_flow(path, np.round(there * 16) / 16, coarse)
+        if not is_backward:
+            trip = round_trip_error(there, back)
+            figures.setdefault(pair.step, []).append((float(sure.mean()), float(np.median(trip))))
     figures.setdefault(pair.step, [])
 
 
@@ -155,7 +138,6 @@ def _write_pair(
 def _copy_given(
     folder: Path,
     clip: Clip,
-    near: np.ndarray,
     out: Path,
     figures: dict[int, list[tuple[float, float]]],
     run: Run,
@@ -163,7 +145,6 @@ def _copy_given(
     """Check the user's flow against the kept frames and write it as ours; every step there must be whole."""
     if not folder.is_dir():
         raise BadInput(f"{folder.name} must be a folder with fw-01, bw-01 and so on")
-    places = {int(idx): t for t, idx in enumerate(clip.source_idx)}
     found = 0
     for step in FLOW_STEPS:
         for backward in (False, True):
@@ -181,15 +162,11 @@ def _copy_given(
                     hint="steps count kept frames; frames.max_frames = 0 and frames.least_change = 0 keep them all",
                 )
             for i in wanted:
-                t = places[int(i)]
                 values, sure = _given_file(files[f"{int(i):05d}"], clip, f"{folder.name}/{given.name}")
                 path = flow_path(out, step, int(i), backward)
                 path.parent.mkdir(exist_ok=True)
-                sure = np.where(near[t], sure, 0.0)
                 write_flow(path, values, sure)
-                on = near[t]
-                if on.any():
-                    figures.setdefault(step, []).append((float(sure[on].mean()), 0.0))
+                figures.setdefault(step, []).append((float(sure.mean()), 0.0))
             figures.setdefault(step, [])
             found += 1
     if not (out / "fw-01").is_dir() or not (out / "bw-01").is_dir():
@@ -238,7 +215,7 @@ def _check(out: Path, frames: Folder) -> None:
 
 @flow.estimate
 def _bytes(video: Source, settings: FlowSettings) -> int:
-    """About a byte a pixel, pair and direction; how many frames will be kept is a guess from the defaults of `frames`."""
+    """About a byte a pixel, pair and direction; how many frames are kept is a guess from the defaults of `frames`."""
     seen = glance(video.path)
     if seen is None:
         return 0

@@ -116,72 +116,15 @@ def direct_pairs(
             yield make_pair(step, i, match(a, b), match(b, a), grid)
 
 
-def shared_window(masks: np.ndarray, margin: float = 0.06, least_px: int = 64) -> tuple[slice, slice]:
-    """Rows and columns of one window that holds the object of every frame of boolean (T, H, W) masks, with a margin."""
-    height, width = masks.shape[1:]
-    union = masks.any(axis=0)
-    if not union.any():
-        return slice(0, height), slice(0, width)
-    pad = 8 + round(margin * max(height, width))
-
-    def span(hit: np.ndarray, full: int) -> slice:
-        on = np.flatnonzero(hit)
-        low, high = int(on[0]) - pad, int(on[-1]) + 1 + pad
-        grow = max(0, least_px - (high - low)) // 2
-        return slice(max(0, low - grow), min(full, high + grow))
-
-    return span(union.any(axis=1), height), span(union.any(axis=0), width)
-
-
-def place(pair: FlowPair, rows: slice, columns: slice, shape: tuple[int, ...]) -> FlowPair:
-    """A pair computed in a window, put back into the whole frame; zero with no confidence outside."""
-
-    def whole(part: np.ndarray) -> np.ndarray:
-        out = np.zeros((*shape, *part.shape[2:]), np.float32)
-        out[rows, columns] = part
-        return out
-
-    maps = (pair.forward, pair.backward, pair.forward_confidence, pair.backward_confidence)
-    return FlowPair(pair.step, pair.first_idx, pair.second_idx, *(whole(m) for m in maps))
-
-
-def isolate(grey: np.ndarray, mask: np.ndarray, reach_px: float = 8.0) -> np.ndarray:
-    """A grey frame (H, W) uint8 with its background replaced by the object's own brightness, spread outwards.
-
-    Without it the background's motion drags the flow of thin limbs along; this halves the error.
-    """
-    weight = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
-    if not weight.any():
-        return grey
-    values = grey.astype(np.float32)
-    mean = float(values[weight > 0].mean())
-    spread = cv2.GaussianBlur(values * weight, (0, 0), reach_px) + 0.01 * mean
-    spread /= cv2.GaussianBlur(weight, (0, 0), reach_px) + 0.01
-    alpha = cv2.GaussianBlur(weight, (0, 0), 1.0)
-    return np.clip(alpha * values + (1 - alpha) * spread, 0, 255).astype(np.uint8)
-
-
-def similar_motion(first: np.ndarray, second: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Flow (H, W, 2) of the shift and scale that bring one mask's centre and area to another's."""
-    a, b = first.astype(bool), second.astype(bool)
-    if not a.any() or not b.any():
-        return np.zeros_like(grid)
-    centre, target = grid[a].mean(axis=0), grid[b].mean(axis=0)
-    scale = float(np.clip(np.sqrt(np.count_nonzero(b) / np.count_nonzero(a)), 0.5, 2.0))
-    return ((target + scale * (grid - centre)) - grid).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class Chain:
     """Matches all pairs of a clip, long steps started from chained short ones.
 
     A step that is a sum of two equal ones (2 = 1 + 1, 4 = 2 + 2 ...) is matched from the chain; where that does not
-    close its round trip, also from the shift and scale of the whole object, and each pixel takes what closes better.
-    `frames` is (T, H, W) uint8, best with the background isolated; `masks` (T, H, W) bool.
+    close its round trip, also from nothing, and each pixel takes what closes better. `frames` is (T, H, W) uint8.
     """
 
     frames: np.ndarray
-    masks: np.ndarray
     matcher: Matcher
     shortest: Matcher  # used for the smallest step
 
@@ -201,15 +144,14 @@ class Chain:
     def _pair(
         self, step: int, i: int, one: FlowPair | None, two: FlowPair | None, match: Matcher, grid: np.ndarray
     ) -> FlowPair:
-        a, b, on_a, on_b = self.frames[i], self.frames[i + step], self.masks[i], self.masks[i + step]
+        a, b = self.frames[i], self.frames[i + step]
         chained = None
         if one is not None and two is not None:
             there, back = compose(one.forward, two.forward, grid), compose(two.backward, one.backward, grid)
             chained = make_pair(step, i, match(a, b, there), match(b, a, back), grid)
-            if on_a.any() and chained.forward_confidence[on_a].mean() > 0.9:
+            if chained.forward_confidence.mean() > 0.9:
                 return chained
-        there, back = similar_motion(on_a, on_b, grid), similar_motion(on_b, on_a, grid)
-        direct = make_pair(step, i, match(a, b, there), match(b, a, back), grid)
+        direct = make_pair(step, i, match(a, b), match(b, a), grid)
         if chained is None:
             return direct
         forward = _better(chained.forward, chained.forward_confidence, direct.forward, direct.forward_confidence)

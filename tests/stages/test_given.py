@@ -118,7 +118,7 @@ def run_flow(frames: Folder, tmp_path: Path, folder: Path) -> Path:
     truth = write_masks_folder(tmp_path / "masks", TRUTH[KEPT], clip)
     out = tmp_path / "flow-out"
     out.mkdir(exist_ok=True)
-    flow(frames=frames, masks=truth, given=given(flow=folder), settings=FlowSettings(), out=out, run=Run())
+    flow(frames=frames, given=given(flow=folder), settings=FlowSettings(), out=out, run=Run())
     check_flow(out=out, frames=frames)
     return out
 
