@@ -120,7 +120,7 @@ def _rotation_deg(frame: av.VideoFrame) -> int:
 
 
 def _upright(frame: av.VideoFrame, aspect: float) -> tuple[np.ndarray, int]:
-    image = frame.to_ndarray(format="rgb24")
+    image: np.ndarray = frame.to_ndarray(format="rgb24")
     if abs(aspect - 1.0) > 0.01:  # non-square pixels: widen or narrow, never throw rows away
         width = max(1, round(image.shape[1] * aspect))
         image = cv2.resize(image, (width, image.shape[0]), interpolation=cv2.INTER_AREA)

@@ -6,6 +6,7 @@ that the settings name, the built-in segmentation by motion, place and colour (s
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Video, stage
-from stages.decoding import list_images, natural_key, read_frames
+from stages.decoding import list_images, read_frames
 from stages.formats import (
     Clip,
     FormatError,
@@ -35,7 +36,7 @@ from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
-from stages.perception.temporal import describe
+from stages.perception.temporal import area_steadiness, describe
 
 ASPECT_TOLERANCE = 0.02
 HINT_KEYS = {"frame", "time_s", "box", "inside", "outside"}
@@ -118,7 +119,7 @@ def pick_files(stems: list[str], clip: Clip, what: str) -> list[int]:
         return [int(i) for i in clip.source_idx]
     numbers = {}
     for position, stem in enumerate(stems):
-        digits = [part[1] for part in natural_key(stem) if part[0] == 0]
+        digits = [int(digits) for digits in re.findall(r"\d+", stem)]
         if digits:
             numbers[digits[-1]] = position
     wanted = [int(i) for i in clip.source_idx]
@@ -232,7 +233,7 @@ def _facts(provider: str, result: Segmentation, clip: Clip, threshold: float) ->
     track = describe(binary, _carried(binary, clip))
     confidence = np.clip(result.agreement, 0, 1)
     if not provider.startswith("given"):
-        confidence = confidence * np.clip(track.overlap / 0.8, 0, 1)
+        confidence = confidence * np.clip(track.overlap / 0.8, 0, 1) * np.clip(area_steadiness(track.area) / 0.7, 0, 1)
     confidence = np.where(track.area > 0, confidence, 0.0)
     return MaskFacts(provider, track.box, track.area, confidence, track.flags)
 

@@ -135,14 +135,14 @@ class Network:
         resized = cv2.resize(
             image, (size[1], size[0]), interpolation=cv2.INTER_AREA if size[0] < image.shape[0] else cv2.INTER_LINEAR
         )
-        values = resized.astype(np.float32)
+        values: np.ndarray = resized.astype(np.float32)
         if self.contract.scale == "unit":
             values /= 255.0
         elif self.contract.scale == "own-max":
             values /= max(float(values.max()), 1.0)
         if self.contract.colour == "bgr":
             values = values[..., ::-1]
-        values = (values - np.float32(self.contract.mean)) / np.float32(self.contract.std)
+        values = (values - np.array(self.contract.mean, np.float32)) / np.array(self.contract.std, np.float32)
         return np.ascontiguousarray(values.transpose(2, 0, 1)[None]).astype(self.dtype)
 
     def run(self, *tensors: np.ndarray) -> np.ndarray:
@@ -192,7 +192,7 @@ class FlowNetwork(Network):
             raise BadInput(f"{self.path.name} gives shape {raw.shape}, a flow of 1x2xHxW expected")
         flow = cv2.resize(raw[0].transpose(1, 2, 0), (width, height), interpolation=cv2.INTER_LINEAR)
         # A coarser output is still in pixels of the input, so the scale is the input's.
-        return flow * np.float32([width / size[1], height / size[0]])
+        return flow * np.array([width / size[1], height / size[0]], np.float32)
 
 
 class FeatureNetwork(Network):

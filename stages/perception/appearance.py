@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from stages.perception.background import to_lab
 
-LAB_UNIT = np.float32([50.0, 25.0, 25.0])
+LAB_UNIT = np.array([50.0, 25.0, 25.0], np.float32)
 LOGIT_LIMIT = 6.0
 
 
@@ -31,11 +31,18 @@ class PixelColours:
         self.mean, self.scale = torch.zeros(channels), torch.ones(channels)
 
     def fit(
-        self, values: np.ndarray, label: np.ndarray, weight: np.ndarray, steps: int = 400, batch: int = 4096
+        self,
+        values: np.ndarray,
+        label: np.ndarray,
+        weight: np.ndarray,
+        steps: int = 400,
+        batch: int = 4096,
+        mixed: float = 0.0,
     ) -> bool:
         """Fit to features (..., C), labels (...) in {0, 1} and weights (...); False where one class has no pixels.
 
-        A third of each batch is foreground.
+        A third of each batch is foreground. A share `mixed` of it is blended with background at random, and counts as
+        what it is mostly: pixels on an outline are such blends, and look more like the object than they are.
         """
         flat = torch.from_numpy(values.reshape(-1, values.shape[-1]))
         y = torch.from_numpy(np.ascontiguousarray(label, np.float32).ravel())
@@ -54,8 +61,17 @@ class PixelColours:
                     negative[torch.randint(len(negative), (2 * batch // 3,), generator=self.generator)],
                 ]
             )
-            logit = self.net((flat[chosen] - self.mean) / self.scale)[:, 0]
-            loss = functional.binary_cross_entropy_with_logits(logit, y[chosen], weight=w[chosen])
+            inputs, wanted, trust = (flat[chosen] - self.mean) / self.scale, y[chosen], w[chosen]
+            count = round(mixed * (batch // 3))
+            if count:
+                alpha = torch.rand(count, generator=self.generator)
+                front, back = inputs[:count], inputs[-count:]
+                blend = back + alpha[:, None] * (front - back)
+                inputs = torch.cat([blend, inputs[count:]])
+                wanted = torch.cat([(alpha > 0.5).float(), wanted[count:]])
+                trust = torch.cat([(2 * alpha - 1).abs() * trust[:count], trust[count:]])
+            logit = self.net(inputs)[:, 0]
+            loss = functional.binary_cross_entropy_with_logits(logit, wanted, weight=trust)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -107,7 +123,7 @@ class ClipNetwork:
 
     def __init__(self, seed: int) -> None:
         self.generator = torch.Generator().manual_seed(seed)
-        self.net = _SmallUnet().to(memory_format=torch.channels_last)  # more than twice as fast on a CPU
+        self.net = _SmallUnet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on a CPU
         _seed_weights(self.net, self.generator)
 
     def fit(
@@ -184,4 +200,4 @@ def _seed_weights(module: nn.Module, generator: torch.Generator) -> None:
 
 def scaled_lab(image: np.ndarray) -> np.ndarray:
     """(H, W, 3) float32 Lab of an 8-bit RGB image in units of about 1."""
-    return to_lab(image) / LAB_UNIT - np.float32([1.0, 0.0, 0.0])
+    return to_lab(image) / LAB_UNIT - np.array([1.0, 0.0, 0.0], np.float32)

@@ -60,7 +60,7 @@ def background_flow(
     prior = trust[grid].ravel().astype(np.float64)
     sure = prior >= np.quantile(prior, 0.5)
     weight, scatter = prior, 1.0
-    coefficients = np.zeros((a.shape[1], 2))
+    coefficients: np.ndarray = np.zeros((a.shape[1], 2))
     for step in range(10):
         weighted = a * weight[:, None]
         coefficients = np.linalg.solve(weighted.T @ a + 1e-4 * np.eye(a.shape[1]), weighted.T @ b)

@@ -23,6 +23,7 @@ from stages.perception.optical_flow import Matcher, sample
 from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
+BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
 CARRY_SIDE_PX = 128
 Tick = Callable[[int, int, str], None]
 
@@ -153,12 +154,14 @@ def tight_probability(
     """
     values = np.stack([scaled_lab(image) for image in work])
     depth = np.stack([_signed_distance(s > 0.5) for s in soft])
+    # Well inside the outline is the object whatever its colour.
+    within = 0.3 * np.clip(depth - 2.5 * rim_px, 0, 12)
     found = soft
     for turn in range(2):
         core, off, close = _rim(found > 0.5, max(1, rim_px - turn))
         weight = core + off * np.where(close, 1.0, 0.15)
         colours = PixelColours(values.shape[-1], effort.seed + 10 + turn)
-        if not colours.fit(values, core, weight, steps=500):
+        if not colours.fit(values, core, weight, steps=500, mixed=BLENDED_SHARE):
             return found
         looks = np.full(found.shape, -6.0, np.float32)
         looks[~off] = colours.logit(values[~off])
@@ -166,8 +169,8 @@ def tight_probability(
         right = ((looks[core > 0] > 0).mean() + (colours.logit(values[beside]) < 0).mean()) / 2
         told_apart = float(np.clip((right - 0.8) / 0.15, 0, 1))
         looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.8) for x in looks])
-        place = (1.0 - 0.7 * told_apart) * np.clip(0.5 * (depth - rim_px), -3.0, 3.0)
-        looks = (0.4 + 0.6 * told_apart) * (looks - 0.5 - 1.3 * told_apart)
+        place = (1.0 - 0.7 * told_apart) * np.clip(0.5 * (depth - rim_px), -3.0, 3.0) + within
+        looks = (0.4 + 0.6 * told_apart) * (looks - 0.5 + 1.1 * told_apart)
         logit = looks + place + 0.5 * np.clip(cues.evidence, -1, 3) + told
         found = np.where(off, 0.002, _sigmoid(logit)).astype(np.float32)
         found = np.stack([main_component(f > 0.5, f) * f for f in found])
@@ -216,7 +219,7 @@ def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentati
 def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[int, ...], count: int) -> np.ndarray:
     """(T, h, w) log-odds from the user's hints at their own frames, zero elsewhere."""
     out = np.zeros((count, *work), np.float32)
-    scale = np.array([work[1] / full[1], work[0] / full[0]])
+    scale: np.ndarray = np.array([work[1] / full[1], work[0] / full[0]])
     rows, columns = np.mgrid[0 : work[0], 0 : work[1]] + 0.5
     for hint in hints:
         layer = out[hint.frame_idx]

@@ -91,23 +91,36 @@ def main_component(mask: np.ndarray, anchor: np.ndarray | None = None, keep_shar
 
 
 def flow_median(soft: np.ndarray, to_next: list[np.ndarray], to_previous: list[np.ndarray]) -> np.ndarray:
-    """(T, h, w) maps, each blended with the median of itself and its neighbours' along the flow.
+    """(T, h, w) maps; those that flicker are blended with the median of themselves and their neighbours along the flow.
 
-    `to_next[t]` is the flow t -> t+1 and `to_previous[t]` t+1 -> t, at any smaller size. What only one frame says, is
-    outvoted by the two beside it.
+    `to_next[t]` is the flow t -> t+1 and `to_previous[t]` t+1 -> t, at any smaller size. A frame flickers when its
+    mask differs from that median by much more than is usual in the clip; the others keep their fast thin limbs.
     """
     count, height, width = soft.shape
     if count < 3:
         return soft
-    out = soft.copy()
+    medians = [soft[0]]
     for t in range(1, count - 1):
         before = sample(soft[t - 1], enlarge(to_previous[t - 1], width, height))
         after = sample(soft[t + 1], enlarge(to_next[t], width, height))
-        out[t] = 0.4 * soft[t] + 0.6 * np.median([before, soft[t], after], axis=0)
+        medians.append(np.median([before, soft[t], after], axis=0))
+    medians.append(soft[-1])
+    change = np.array([1 - intersection_over_union(s > 0.5, m > 0.5) for s, m in zip(soft, medians, strict=True)])
+    flickers = change > 2 * np.median(change) + 0.1
+    return np.stack([0.3 * s + 0.7 * m if f else s for s, m, f in zip(soft, medians, flickers, strict=True)])
+
+
+def area_steadiness(area: np.ndarray, reach: int = 7) -> np.ndarray:
+    """(T,) in 0..1: how near each frame's area is to the median of the frames within `reach`; 0 where it is gone."""
+    out = np.zeros(len(area))
+    for t in range(len(area)):
+        usual = float(np.median(area[max(0, t - reach) : t + reach + 1]))
+        if min(usual, area[t]) > 0:
+            out[t] = min(area[t] / usual, usual / area[t])
     return out
 
 
 def enlarge(flow: np.ndarray, width: int, height: int) -> np.ndarray:
     """A flow (h, w, 2) at another size, its lengths scaled along."""
-    scale = np.float32([width / flow.shape[1], height / flow.shape[0]])
+    scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     return cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale

@@ -13,7 +13,7 @@ from stages.masks import MaskSettings, _check, _sheet, masks
 from stages.perception.appearance import ClipNetwork, PixelColours
 from stages.perception.background import background_flow, bend_to_surroundings, motion_cues, polynomial_basis
 from stages.perception.segmentation import Effort, Hint, hint_evidence, segment
-from stages.perception.temporal import describe, flow_median, main_component, mask_box, touches_border
+from stages.perception.temporal import area_steadiness, describe, flow_median, main_component, mask_box, touches_border
 from tests.stages.perception_clips import moving_clip, overlap, texture, write_frames_folder
 
 IMAGES, TRUTH, _ = moving_clip(10, 96)
@@ -191,3 +191,21 @@ def test_flow_median_outvotes_one_frame() -> None:
     soft[2] = 0
     still = [np.zeros((16, 16, 2), np.float32)] * 4
     assert flow_median(soft, still, still)[2, 12, 12] > 0.5
+    soft[2] = 1
+    np.testing.assert_array_equal(flow_median(soft, still, still)[[0, 1, 3, 4]], soft[[0, 1, 3, 4]])
+
+
+def test_area_steadiness_shows_the_frame_that_shrinks() -> None:
+    steady = area_steadiness(np.array([0.1, 0.1, 0.11, 0.02, 0.1, 0.0, 0.1]))
+    assert steady[3] < 0.25 and steady[5] == 0 and steady[[0, 1, 2, 4, 6]].min() > 0.85
+
+
+def test_blends_count_as_what_they_are_mostly() -> None:
+    rng = np.random.default_rng(0)
+    label = (np.arange(3000) % 3 == 0).astype(np.float32)
+    values = (label[:, None] + rng.normal(0, 0.05, (3000, 3))).astype(np.float32)
+    edge = np.linspace(0, 1, 101, dtype=np.float32)[:, None].repeat(3, axis=1)
+    model = PixelColours(3, seed=0)
+    model.fit(values, label, np.ones(3000, np.float32), steps=200, mixed=0.9)
+    crossing = edge[np.argmax(model.logit(edge) > 0), 0]
+    assert 0.4 < crossing < 0.6
