@@ -39,7 +39,7 @@ def copy_program(source: Path, target: Path) -> None:
 
 # A reconstruction in seconds: what it looks like is nobody's concern here.
 TINY = (
-    *("--fit.iterations=120", "--fit.voxel=0.07", "--fit.bones=6"),
+    *("--fit.iterations=120", "--fit.voxel=0.07", "--fit.bones=6", "--fit.renew_at=0.5"),
     *("--correct.iterations=30", "--refine.iterations=60"),
     *(f"--{phase}.{key}" for phase in ("fit", "correct", "refine") for key in (
         "frames_per_step=4", "pixels_per_frame=24", "probe_samples=16", "fine_samples=4", "match_pixels=16"
