@@ -117,12 +117,10 @@ def test_flow_slot_scales_to_the_frames(tmp_path: Path) -> None:
     found = FlowNetwork(path)(IMAGES[0], IMAGES[1])  # 96x96 frames, 72x96 network
     np.testing.assert_allclose(found[50, 50], [3.0, -1.5 * 96 / 72], rtol=1e-5)
     frames = write_frames_folder(tmp_path / "frames", IMAGES)
-    truth = write_masks_folder(tmp_path / "masks", TRUTH, read_clip(frames.path))
     out = tmp_path / "out"
     out.mkdir()
     flow(
         frames=frames,
-        masks=truth,
         given=Given(),
         settings=FlowSettings(network=InputFile(str(path))),
         out=out,
