@@ -19,7 +19,7 @@ from stages.registration.upright import upright
 from stages.registration.volume import ViewBank
 from tests.numerics.turning_scene import BEAST, clip_of
 
-QUICK = Effort(starts=5, rounds=12, fine_rounds=4, frames=60, coarse_px=20, fine_px=24)
+QUICK = Effort(starts=4, rounds=11, fine_rounds=3, frames=45, coarse_px=16, fine_px=20)
 
 
 def quiet(done: int, total: int, label: str) -> None:
@@ -98,7 +98,7 @@ def test_given_clips_anchor_the_others(beast_clips: tuple[list[Subject], list[np
     anchored = [
         replace(s, rotation=truth[i] @ own.T, depth=np.full(24, 32.0)) if i != 1 else s for i, s in enumerate(subjects)
     ]
-    little = Effort(starts=3, rounds=10, fine_rounds=3, frames=60, coarse_px=20, fine_px=20)
+    little = Effort(starts=3, rounds=10, fine_rounds=2, frames=45, coarse_px=16, fine_px=18)
     answers = search(anchored, 0, quiet, little)
     assert list(answers) == ["clip-1"]
     # no common rotation to be removed: the answer is in the given clips' own object space

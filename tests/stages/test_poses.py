@@ -204,7 +204,7 @@ def test_raw_clips_are_searched_and_shown(tmp_path: Path, monkeypatch: Any) -> N
         "a": write_clip(tmp_path, "a", np.linspace(-0.9, 1.2, 16)),
         "b": write_clip(tmp_path, "b", np.linspace(3.6, 1.0, 16), distance=3.6),
     }
-    little = Effort(starts=4, rounds=11, fine_rounds=3, frames=32, coarse_px=18, fine_px=20)
+    little = Effort(starts=3, rounds=10, fine_rounds=2, frames=28, coarse_px=16, fine_px=18)
     monkeypatch.setitem(stage_module.PROVIDERS, "search", partial(search, effort=little))
     out, run = run_poses(tmp_path, provider="search")
     tracks = {name: read_poses(out / f"{name}.json") for name in truth}
