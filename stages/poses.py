@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -224,7 +225,7 @@ def _summarise(
     out: Path,
     run: Run,
 ) -> None:
-    videos = {}
+    videos: dict[str, dict[str, Any]] = {}
     for name in clips:
         answer = answers.get(name)
         trust = 1.0 if answer is None else answer.trust
