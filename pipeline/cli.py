@@ -6,14 +6,17 @@ import argparse
 import errno
 import importlib
 import io
+import os
 import re
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 from pipeline.errors import BadInput, ExitCode, PipelineError, did_you_mean
 from pipeline.project import Options
+from pipeline.verbs import Verb, add_arguments, run_verb, verbs_of
 
 _EXIT_CODES = """exit codes: 0 done · 1 an action failed · 2 usage, settings or input at fault · 3 a decision is needed
             4 damage found · 10 work pending (--check) · 75 stopped, resumable · 130 stopped by Ctrl-C"""
@@ -76,7 +79,8 @@ class _Parser(argparse.ArgumentParser):
         """Raise instead of exiting."""
         choice = re.search(r"invalid choice: '([^']*)'", message)
         if choice is not None:
-            raise BadInput(f"there is no command {choice[1]!r}", hint=did_you_mean(choice[1], _VERBS))
+            known = re.findall(r"'([^']+)'", message.partition("(choose from")[2]) or list(_VERBS)
+            raise BadInput(f"there is no command {choice[1]!r}", hint=did_you_mean(choice[1], known))
         raise BadInput(message, hint=f"see `{self.prog} --help`")
 
 
@@ -114,8 +118,8 @@ def split_overrides(argv: list[str]) -> tuple[list[str], list[tuple[str, str]]]:
     return rest, found
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all verbs."""
+def build_parser(own: Mapping[str, Verb] | None = None, called: str = "") -> argparse.ArgumentParser:
+    """The parser of all verbs; `own` are those of the pipeline, of which only the one `called` is imported."""
     parser = _Parser(
         prog="banmo",
         description="A folder of videos in, an animatable 3D model out.",
@@ -134,7 +138,35 @@ def build_parser() -> argparse.ArgumentParser:
             allow_abbrev=False,
         )
         _arguments(name, verb)
+    for name, described in (own or {}).items():
+        if name not in _VERBS:
+            _add_own(verbs, described, called == name)
     return parser
+
+
+def _add_own(verbs: Any, described: Verb, called: bool) -> None:
+    """Add a verb of the pipeline."""
+    verb = verbs.add_parser(
+        described.name,
+        help=described.summary,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    verb.add_argument("--workspace", type=Path, default=Path("workspace"), metavar="DIR", help="default: ./workspace")
+    verb.add_argument("--definition", default="", metavar="PACKAGE", help=argparse.SUPPRESS)
+    if called:
+        summary, examples = add_arguments(described, verb)
+        verb.description = f"{summary[:1].upper()}{summary[1:].rstrip('.')}."
+        verb.epilog = "examples:\n" + "\n".join(f"  {e}" for e in examples) + "\n\n" + _EXIT_CODES
+
+
+def _early_options(words: list[str]) -> Options:
+    """Workspace and pipeline, before the verbs of that pipeline are known."""
+    parser = _Parser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--workspace", type=Path, default=Path("workspace"))
+    parser.add_argument("--definition", default="")
+    known, _ = parser.parse_known_args([w for w in words if w not in ("-h", "--help")])
+    return Options(workspace=known.workspace, definition=known.definition)
 
 
 def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
@@ -205,12 +237,19 @@ def main(argv: list[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         rest, overrides = split_overrides(words)
-        parser = build_parser()
+        verb = next((w for w in rest if not w.startswith("-")), "")
+        own = {} if verb in _VERBS else verbs_of(_early_options(rest))
+        parser = build_parser(own, verb)
         args, unknown = parser.parse_known_args(rest)
         if unknown:
             raise BadInput(
                 f"unknown flag {unknown[0]!r} for {args.verb}", hint=_flag_hint(parser, args.verb, unknown[0])
             )
+        if args.verb in own and args.verb not in _VERBS:
+            if overrides:
+                raise BadInput(f"{args.verb} takes no settings of stages", hint=f"see `banmo {args.verb} --help`")
+            os.environ.setdefault("GOMP_SPINCOUNT", "2000")  # before torch is imported; see child_environment
+            return run_verb(own[args.verb], args, options_of(args, []))
         module: Any = importlib.import_module(f"pipeline.commands.{_VERBS[args.verb][0]}")
         return int(getattr(module, f"{args.verb}_command")(args, options_of(args, overrides)))
     except PipelineError as error:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, TextIO
+from collections.abc import Iterable, Iterator, Sized
+from typing import Any, TextIO, TypeVar
 
 from pipeline.plan import HIT, WAIT, Step
 from pipeline.reasons import brief
 
+T = TypeVar("T")
 _MOST_LINES = 40
 
 
@@ -28,6 +30,34 @@ def size(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" or count >= 100 else f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} TB"
+
+
+def progress(
+    iterable: Iterable[T], total: int | None = None, label: str = "", stream: TextIO | None = None
+) -> Iterator[T]:
+    """Yield from `iterable`, showing how far it is: one line redrawn on a terminal, a line now and then elsewhere."""
+    stream = stream or sys.stderr
+    if total is None and isinstance(iterable, Sized):
+        total = len(iterable)
+    redraw, started, told = stream.isatty(), time.monotonic(), time.monotonic()
+    done = 0
+    try:
+        for item in iterable:
+            yield item
+            done += 1
+            now = time.monotonic()
+            if now - told < (0.2 if redraw else 15.0):
+                continue
+            told = now
+            text = progress_text({"label": label, "done": done, "total": total})
+            if total and done <= total:
+                text += f"  {duration((now - started) * (total - done) / done)} left"
+            stream.write(f"\r\x1b[K{text}" if redraw else f"{time.strftime('%H:%M:%S')}  {text}\n")
+            stream.flush()
+    finally:
+        if redraw and done:
+            stream.write("\r\x1b[K")
+            stream.flush()
 
 
 def print_plan(steps: list[Step], stream: TextIO | None = None) -> None:

@@ -1,12 +1,14 @@
 """The pipeline as data: which stages there are, in order, and what each declares.
 
 The package that defines a pipeline names it in its ``__init__.py`` by three literals, read without importing it:
-``PIPELINE`` (tuple of ``module:function``), ``GROUPS`` (name -> stages) and ``PRESETS`` (a TOML file beside it).
+``PIPELINE`` (tuple of ``module:function``), ``GROUPS`` (name -> stages) and ``PRESETS`` (a TOML file beside it); a
+fourth, ``VERBS``, names commands of its own (:mod:`pipeline.verbs`).
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import importlib.util
 import os
@@ -74,7 +76,7 @@ class Definition:
 def load(package: str, cache: Path | None = None) -> Definition:
     """Read a pipeline's definition; `package` is an importable name or the path of a package's folder."""
     folder = locate(package)
-    constants = _constants(folder / "__init__.py")
+    constants = names_in(folder / "__init__.py")
     references = constants.get("PIPELINE")
     if not isinstance(references, list | tuple) or not all(isinstance(r, str) and ":" in r for r in references):
         raise BadInput("PIPELINE must be a tuple of 'module:function'", where=folder / "__init__.py")
@@ -126,18 +128,19 @@ def child_environment(package_dir: Path) -> dict[str, str]:
     return environment
 
 
-def _constants(path: Path) -> dict[str, Any]:
+def names_in(path: Path) -> dict[str, Any]:
+    """The literals that a module assigns to names at its top, read without importing it."""
     try:
         tree = ast.parse(path.read_bytes(), filename=str(path))
     except (SyntaxError, ValueError) as error:
         raise BadInput(f"not valid Python ({error})", where=path) from error
     found: dict[str, Any] = {}
     for statement in tree.body:
-        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            try:
-                found[statement.targets[0].id] = ast.literal_eval(statement.value)
-            except ValueError:
-                continue
+        target = statement.targets[0] if isinstance(statement, ast.Assign) else None
+        target = statement.target if isinstance(statement, ast.AnnAssign) else target
+        if isinstance(statement, ast.Assign | ast.AnnAssign) and isinstance(target, ast.Name) and statement.value:
+            with contextlib.suppress(ValueError, TypeError):
+                found[target.id] = ast.literal_eval(statement.value)
     return found
 
 

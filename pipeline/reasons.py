@@ -69,6 +69,12 @@ def brief(reasons: list[Reason], limit: int = 2) -> str:
     return "; ".join(words[:limit]) + more
 
 
+def words_of(stored: list[Any], limit: int = 2) -> str:
+    """:func:`brief` of reasons as :meth:`Reason.as_json` wrote them."""
+    known = [r for r in stored if isinstance(r, dict) and r.get("kind") in KINDS]
+    return brief([Reason(r["kind"], str(r.get("name", "")), r.get("old"), r.get("new")) for r in known], limit)
+
+
 def tree(reasons: list[Reason], indent: int = 2, seen: set[str] | None = None) -> list[str]:
     """The reasons as indented lines; a cause told once is not told again."""
     seen = set() if seen is None else seen

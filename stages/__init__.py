@@ -24,3 +24,6 @@ GROUPS = {"optimise": ("fit", "correct", "refine")}
 
 PRESETS = "presets.toml"
 """Settings by purpose, beside this file; the first table is the default preset."""
+
+VERBS: dict[str, str] = {}
+"""Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""
