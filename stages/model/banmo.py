@@ -102,6 +102,7 @@ class Banmo(nn.Module):
         self.use_delta = False
         self.log_focal = nn.Parameter(torch.zeros(count))
         self.register_buffer("base_poses", base_poses.clone().float())
+        self.register_buffer("gauge", torch.eye(4).repeat(len(base_poses), 1, 1))  # see stages.fitting.gauge
         self.register_buffer("surface", torch.zeros(0, 3))
         self.register_buffer("root_free", torch.ones(count))  # 0 holds a video's root poses where they were given
 
@@ -139,9 +140,13 @@ class Banmo(nn.Module):
         k[:, :2, 2] = centre
         return k
 
-    def state_at(self, video_idx: Tensor, time: Tensor, base: Tensor) -> FrameState:
-        """Frame state at normalised `time` (F,) of videos (F,), with initial root poses `base` (F, 4, 4)."""
+    def state_at(self, video_idx: Tensor, time: Tensor, base: Tensor, gauge: Tensor) -> FrameState:
+        """Frame state at normalised `time` (F,) of videos (F,), with initial root poses `base` (F, 4, 4).
+
+        `gauge` (F, 4, 4) is the rigid motion that goes from the root pose to all bones: G gauge^-1 and gauge J_b.
+        """
         transforms, own, code = self.body(video_idx, time, self.bones.centres, self.bones.parents)
+        transforms = gauge[:, None] @ transforms
         rest = score_coefficients(self.bones.centres, self.bones.orientations, self.bones.log_scales)[None]
         centres = (transforms[..., :3, :3] @ self.bones.centres[..., None]).squeeze(-1) + transforms[..., :3, 3]
         posed = score_coefficients(centres, transforms[..., :3, :3] @ self.bones.orientations, self.bones.log_scales)
@@ -152,7 +157,7 @@ class Banmo(nn.Module):
             posed_coefficients=posed,
             rest_coefficients=rest,
             code=code,
-            camera_from_object=self.root(video_idx, time, base, self.root_free[video_idx]),
+            camera_from_object=self.root(video_idx, time, base, self.root_free[video_idx]) @ invert_rigid(gauge),
             intrinsics=self.intrinsics_of(video_idx),
             environment=self.environment(video_idx, time),
         )
@@ -160,7 +165,7 @@ class Banmo(nn.Module):
     def frames(self, frame_idx: Tensor) -> FrameState:
         """Frame state of kept frames `frame_idx` (F,), counted over the collection."""
         index = frame_idx.to(self.time.device)
-        return self.state_at(self.video_idx[index], self.time[index], self.base_poses[index])
+        return self.state_at(self.video_idx[index], self.time[index], self.base_poses[index], self.gauge[index])
 
     # ------------------------------------------------------------------------------------------ warps
 
@@ -213,7 +218,7 @@ class Banmo(nn.Module):
             torch.Generator().manual_seed(0),
         )
         model.surface = torch.zeros_like(tensors["surface"])
-        model.load_state_dict(tensors)
+        model.load_state_dict({"gauge": model.gauge, **tensors})
         model.use_delta = bool(description["use_delta"])
         return model
 
@@ -272,7 +277,8 @@ class Banmo(nn.Module):
         start, end = self.starts[video_idx], self.starts[video_idx + 1]
         known = torch.tensor(self.videos[video_idx].time_s, dtype=torch.float64)
         base = interpolate_rigid(self.base_poses[start:end], known, time_s.double())
-        return self.state_at(video, self.normalised_time(video_idx, time_s), base)
+        gauge = interpolate_rigid(self.gauge[start:end], known, time_s.double())
+        return self.state_at(video, self.normalised_time(video_idx, time_s), base, gauge)
 
     @torch.no_grad()
     def bone_transforms(self, video_idx: int, time_s: Tensor) -> Tensor:

@@ -1,0 +1,97 @@
+"""Which part of the motion is the root's: object space is settled so that most of the surface stays where it is.
+
+Pictures only see ``G(t) J_b(t)``; a rigid motion can move from the root pose G to all bones J at once and nothing
+rendered changes. What the fit leaves there is whatever the first root poses had wrong, so it is settled afterwards:
+object space is the frame in which the bulk of the surface (a trunk, not limbs) is nearly at rest.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from stages.geometry.rotations import rigid
+from stages.model.banmo import Banmo
+
+
+@torch.no_grad()
+def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25) -> float:
+    """Set ``model.gauge`` so that the surface moves least in object space; given root poses stay as they are.
+
+    `softness` (units) is the distance from which a point counts as moving limb. Returns the mean turn made (radians)
+    over the frames whose root poses are free.
+    """
+    points = model.surface
+    if len(points) < 10:
+        return 0.0
+    points = points[:: max(1, -(-len(points) // most))]
+    index = torch.arange(len(model.time), device=points.device)
+    posed = torch.cat(
+        [
+            model.forward_points(model.frames(some), points[None].expand(len(some), -1, -1)).cpu()
+            for some in index.split(64)
+        ]
+    )
+    free = (model.root_free[model.video_idx] > 0).cpu()
+    if not free.any():
+        return 0.0
+    motion = rigid_parts(posed, free, softness, rounds)
+    model.gauge.copy_(motion.to(model.gauge) @ model.gauge)
+    trace = motion[free, :3, :3].diagonal(dim1=1, dim2=2).sum(-1)
+    return float(((trace - 1) / 2).clamp(-1, 1).acos().mean())
+
+
+def rigid_parts(posed: Tensor, free: Tensor, softness: float, rounds: int) -> Tensor:
+    """Rigid motions (T, 4, 4) that bring the frames' points (T, N, 3) to one common shape, identity where not `free`.
+
+    Generalised Procrustes analysis with a Geman-McClure cost: points further than `softness` from the common shape
+    hardly count. The softness starts wide; at the end each frame is aligned anew from where its neighbours ended and
+    from plain least squares, and keeps what explains most of it.
+    """
+    motion = torch.eye(4).repeat(len(posed), 1, 1)
+    shape = posed.median(0).values
+    for i in range(rounds):
+        found = _descend(posed, shape, motion, max(softness, 0.3 * 0.8**i), 1)
+        motion[free] = found[free]
+        shape = _moved(posed, motion).median(0).values
+    everywhere = torch.ones(posed.shape[:2])
+    starts = [align(posed, shape, everywhere), motion.roll(1, 0), motion.roll(-1, 0)]
+    for start in starts:
+        found = _descend(posed, shape, start, 3 * softness, 6)
+        found = _descend(posed, shape, found, softness, 6)
+        better = free & (_cost(posed, shape, found, softness) < _cost(posed, shape, motion, softness))
+        motion[better] = found[better]
+    return motion
+
+
+def _moved(points: Tensor, motion: Tensor) -> Tensor:
+    return points @ motion[:, :3, :3].transpose(1, 2) + motion[:, None, :3, 3]
+
+
+def _distance(points: Tensor, shape: Tensor, motion: Tensor, width: float) -> Tensor:
+    return (_moved(points, motion) - shape).square().sum(-1) / width**2
+
+
+def _cost(points: Tensor, shape: Tensor, motion: Tensor, width: float) -> Tensor:
+    distance = _distance(points, shape, motion, width)
+    return (distance / (1 + distance)).mean(1)
+
+
+def _descend(points: Tensor, shape: Tensor, motion: Tensor, width: float, steps: int) -> Tensor:
+    """Iteratively reweighted least squares from `motion` (T, 4, 4)."""
+    for _ in range(steps):
+        motion = align(points, shape, (1 + _distance(points, shape, motion, width)).pow(-2))
+    return motion
+
+
+def align(points: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Rigid motions (T, 4, 4) from points (T, N, 3) to a target (N, 3), weighted (T, N) least squares (Kabsch)."""
+    share = weight / weight.sum(1, keepdim=True)
+    here = (share[..., None] * points).sum(1)
+    there = share @ target
+    covariance = torch.einsum("tn,tni,tnj->tij", share, target[None] - there[:, None], points - here[:, None])
+    u, _, vt = torch.linalg.svd(covariance.double())
+    flip = torch.ones(len(points), 3, dtype=torch.float64)
+    flip[:, 2] = torch.linalg.det(u @ vt)
+    rotation = ((u * flip[:, None]) @ vt).float()
+    return rigid(rotation, there - (rotation @ here[..., None]).squeeze(-1))

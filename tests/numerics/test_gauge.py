@@ -1,0 +1,82 @@
+"""The rigid motion that root poses and bones share is found, moved over, and changes no picture."""
+
+import pytest
+import torch
+
+from stages.fitting.gauge import align, rigid_parts, settle
+from stages.geometry.rotations import rigid, so3_exp
+from stages.model.banmo import Architecture, Banmo, VideoFacts
+from stages.model.skeleton import Bones
+
+
+def _rigid(count: int, angle: float, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    vectors = angle * torch.randn(count, 3, generator=generator)
+    return rigid(so3_exp(vectors), 0.1 * torch.randn(count, 3, generator=generator))
+
+
+def test_align_finds_a_known_motion_and_never_a_reflection() -> None:
+    points = torch.randn(1, 60, 3, generator=torch.Generator().manual_seed(1))
+    known = _rigid(1, 1.0, 2)[0]
+    target = points[0] @ known[:3, :3].T + known[:3, 3]
+    assert torch.allclose(align(points, target, torch.ones(1, 60))[0], known, atol=1e-5)
+    mirrored = align(points, target * torch.tensor([-1.0, 1, 1]), torch.ones(1, 60))[0]
+    assert float(torch.linalg.det(mirrored[:3, :3])) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_swinging_limb_does_not_turn_the_trunk() -> None:
+    generator = torch.Generator().manual_seed(3)
+    trunk = 0.3 * torch.randn(300, 3, generator=generator)
+    limb = 0.05 * torch.randn(120, 3, generator=generator) + torch.tensor([0.0, -0.8, 0.0])
+    swing = so3_exp(torch.stack([torch.linspace(-1, 1, 30), torch.zeros(30), torch.zeros(30)], 1))
+    shape = torch.cat([trunk.expand(30, -1, -1), limb @ swing.transpose(1, 2)], 1)
+    wobble = _rigid(30, 0.15, 4)
+    posed = shape @ wobble[:, :3, :3].transpose(1, 2) + wobble[:, None, :3, 3]
+    found = rigid_parts(posed, torch.ones(30, dtype=torch.bool), 0.05, 25)
+    rest = found @ wobble  # the same for every frame, up to one motion of all
+    relative = rest[0, :3, :3].T @ rest[:, :3, :3]
+    angles = ((relative.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1).acos()
+    assert float(angles.max()) < 0.02  # plain least squares leaves 0.2 and more
+
+
+@pytest.fixture
+def model() -> Banmo:
+    generator = torch.Generator().manual_seed(0)
+    videos = [
+        VideoFacts(name, tuple(i / 10 for i in range(8)), 64, 64, (60.0, 60.0), (32.0, 32.0)) for name in ("a", "b")
+    ]
+    base = torch.eye(4).repeat(16, 1, 1)
+    base[:, 2, 3] = 3.0
+    bounds = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    bones = Bones(0.4 * torch.randn(4, 3, generator=generator), torch.full((4, 3), -1.5), torch.zeros(4).long())
+    made = Banmo(Architecture(voxel=0.2), videos, base, bounds, bones, generator)
+    made.surface = 0.5 * torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
+    with torch.no_grad():
+        made.body.head.out.bias[:3] = torch.tensor([0.3, 0.0, 0.0])  # the root bone turns, and all others with it
+        made.body.head.out.weight[:3] += 0.05 * torch.randn(3, 128, generator=generator)
+    return made
+
+
+def test_settling_changes_no_picture_and_only_free_clips(model: Banmo) -> None:
+    model.root_free[1] = 0.0
+    time = torch.tensor([0.0, 0.25, 0.7])
+
+    def camera(video: int) -> torch.Tensor:
+        root = model.root_poses(video, time)
+        return model.forward_warp(model.surface, video, time) @ root[:, :3, :3].transpose(1, 2) + root[:, None, :3, 3]
+
+    before, roots = [camera(0), camera(1)], [model.root_poses(0, time), model.root_poses(1, time)]
+    spread = model.forward_warp(model.surface, 0, time).std(0).mean()
+    assert settle(model) > 0.0
+    assert torch.equal(model.root_poses(1, time), roots[1])
+    assert not torch.allclose(model.root_poses(0, time), roots[0], atol=1e-3)
+    for video in (0, 1):
+        assert torch.allclose(camera(video), before[video], atol=1e-5)
+    assert model.forward_warp(model.surface, 0, time).std(0).mean() < 0.5 * spread
+
+
+def test_a_model_keeps_its_gauge_on_disk(model: Banmo) -> None:
+    settle(model)
+    again = Banmo.restore(dict(model.state_dict()), model.describe())
+    time = torch.tensor([0.3])
+    assert torch.equal(again.root_poses(0, time), model.root_poses(0, time))
