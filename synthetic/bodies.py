@@ -69,8 +69,31 @@ FOX = QuadrupedShape(
     leg=0.68, chest=0.185, belly=0.155, haunch=0.14, limb=0.042, paw=0.05, neck=0.28, muzzle=0.18, muzzle_girth=0.055,
     skull=0.122, ear=0.21, tail=0.85, tail_girth=0.11, tail_pitch_deg=-25,
 )  # fmt: skip
-KINDS = {"cat": CAT, "dog": DOG, "fox": FOX}
+HORSE = QuadrupedShape(
+    leg=0.98, stance=0.12, chest=0.23, belly=0.2, haunch=0.19, limb=0.045, paw=0.055, neck=0.56, neck_girth=0.12,
+    neck_pitch_deg=46, skull=0.115, muzzle=0.32, muzzle_girth=0.085, ear=0.1, tail=0.6, tail_girth=0.06,
+    tail_pitch_deg=-60,
+)  # fmt: skip
+KINDS = {"cat": CAT, "dog": DOG, "fox": FOX, "horse": HORSE}
 """Named proportions."""
+
+
+def vary_quadruped(rng: np.random.Generator) -> QuadrupedShape:
+    """Any quadruped: from the proportions of a cat, a dog or a horse, far enough to meet what none of them is like."""
+    start = (CAT, DOG, HORSE, DOG)[int(rng.integers(4))]
+    shape = vary(start, rng, 0.17)
+    shape = replace(
+        shape,
+        ear=float(rng.uniform(0.1, 0.33)),
+        ear_droop=float(rng.choice([0.0, rng.uniform(0, 1)], p=[0.68, 0.32])),
+        muzzle=float(rng.uniform(0.05, 0.32)),
+        skull=float(rng.uniform(0.11, 0.2)),
+        tail=float(rng.uniform(0.12, 1.15)),
+        tail_girth=float(rng.uniform(0.03, 0.07) if rng.random() < 0.6 else rng.uniform(0.07, 0.16)),
+        tail_pitch_deg=float(rng.uniform(-65, 75)),
+        neck_pitch_deg=float(rng.uniform(15, 65)),
+    )
+    return replace(shape, muzzle_girth=shape.skull * float(rng.uniform(0.38, 0.72)))
 
 
 def vary(shape: QuadrupedShape, rng: np.random.Generator, amount: float = 0.08) -> QuadrupedShape:
