@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from pipeline.errors import BadInput, ExitCode, PipelineError, did_you_mean
 from pipeline.project import Options
-from pipeline.verbs import Verb, add_arguments, run_verb, verbs_of
+from pipeline.verbs import Verb, add_arguments, run_verb, takes_settings, verbs_of
 
 _EXIT_CODES = """exit codes: 0 done · 1 an action failed · 2 usage, settings or input at fault · 3 a decision is needed
             4 damage found · 10 work pending (--check) · 75 stopped, resumable · 130 stopped by Ctrl-C"""
@@ -246,8 +246,9 @@ def main(argv: list[str] | None = None) -> int:
                 f"unknown flag {unknown[0]!r} for {args.verb}", hint=_flag_hint(parser, args.verb, unknown[0])
             )
         if args.verb in own and args.verb not in _VERBS:
-            if overrides:
+            if overrides and not takes_settings(own[args.verb]):
                 raise BadInput(f"{args.verb} takes no settings of stages", hint=f"see `banmo {args.verb} --help`")
+            args.overrides = overrides
             os.environ.setdefault("GOMP_SPINCOUNT", "2000")  # before torch is imported; see child_environment
             return run_verb(own[args.verb], args, options_of(args, []))
         module: Any = importlib.import_module(f"pipeline.commands.{_VERBS[args.verb][0]}")

@@ -40,6 +40,7 @@ class StageInfo:
     data: tuple[str, ...] = ()
     cpus: int = 1
     gpus: int = 0
+    distributed: bool = False
     inputs: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     doc: str = ""
@@ -80,15 +81,18 @@ def load(package: str, cache: Path | None = None) -> Definition:
     references = constants.get("PIPELINE")
     if not isinstance(references, list | tuple) or not all(isinstance(r, str) and ":" in r for r in references):
         raise BadInput("PIPELINE must be a tuple of 'module:function'", where=folder / "__init__.py")
-    reader = CodeReader(folder, cache / "code.json" if cache else None)
-    infos = _describe_all(folder, list(references), reader, cache)
+    root = folder  # a pipeline may be defined by a package inside another one, whose modules it then shares
+    while (root.parent / "__init__.py").is_file():
+        root = root.parent
+    reader = CodeReader(root, cache / "code.json" if cache else None)
+    infos = _describe_all(root, list(references), reader, cache)
     stages = {info.name: info for info in infos}
     _check_order(infos)
     presets_path = folder / str(constants["PRESETS"]) if constants.get("PRESETS") else None
     presets = read_toml(presets_path) if presets_path else {}
     groups = {str(k): tuple(v) for k, v in (constants.get("GROUPS") or {}).items()}
     reader.save()
-    return Definition(folder, stages, groups, presets, presets_path)
+    return Definition(root, stages, groups, presets, presets_path)
 
 
 def locate(package: str) -> Path:
@@ -122,6 +126,8 @@ def child_environment(package_dir: Path) -> dict[str, str]:
     paths = [str(_ENGINE_ROOT), str(package_dir.parent), *environment.get("PYTHONPATH", "").split(os.pathsep)]
     environment["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(p for p in paths if p))
     environment["PYTHONHASHSEED"] = "0"
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        environment.pop(name, None)  # those of whoever started us are not the worker's
     environment.setdefault("GOMP_SPINCOUNT", "2000")  # spinning threads starve their neighbours on a shared machine
     environment.setdefault("MALLOC_TRIM_THRESHOLD_", "17179869184")  # both: fewer page faults, training gains a fifth
     environment.setdefault("MALLOC_MMAP_MAX_", "0")
@@ -155,7 +161,7 @@ def _describe_all(folder: Path, references: list[str], reader: CodeReader, cache
             missing[reference] = f"there is no file for {module} yet"
             continue
         code = reader.fingerprint(module)
-        material = f"3\n{sys.version}\n{reference}\n{code.digest}\n".encode() + path.read_bytes()
+        material = f"4\n{sys.version}\n{reference}\n{code.digest}\n".encode() + path.read_bytes()
         keys[reference] = hashlib.sha256(material).hexdigest()
         stored = read_json(cache / "contracts" / f"{keys[reference]}.json") if cache else None
         if isinstance(stored, dict) and stored.get("reference") == reference:
@@ -184,6 +190,7 @@ def _describe_all(folder: Path, references: list[str], reader: CodeReader, cache
                 data=tuple(value["data"]),
                 cpus=value["cpus"],
                 gpus=value["gpus"],
+                distributed=value["distributed"],
                 inputs=tuple(value["inputs"]),
                 takes=tuple(value["takes"]),
                 doc=value["doc"],

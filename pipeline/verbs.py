@@ -70,6 +70,14 @@ def add_arguments(verb: Verb, parser: argparse.ArgumentParser) -> tuple[str, tup
     return str(module.SUMMARY), tuple(module.EXAMPLES)
 
 
+def takes_settings(verb: Verb) -> bool:
+    """Whether settings of stages (``--stage.key value``) are for this verb: it says ``TAKES_SETTINGS = True``.
+
+    It then finds them in ``args.overrides``, as (name, text).
+    """
+    return bool(getattr(verb.load(), "TAKES_SETTINGS", False))
+
+
 def run_verb(verb: Verb, args: argparse.Namespace, options: Options) -> int:
     """Run a verb on the results of a workspace; returns its exit code."""
     module: Any = verb.load()

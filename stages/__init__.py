@@ -25,5 +25,7 @@ GROUPS = {"optimise": ("fit", "correct", "refine")}
 PRESETS = "presets.toml"
 """Settings by purpose, beside this file; the first table is the default preset."""
 
-VERBS: dict[str, str] = {}
+VERBS = {
+    "retarget": "stages.verbs.retarget",
+}
 """Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""

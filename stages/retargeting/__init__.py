@@ -1,0 +1,19 @@
+"""Retargeting as a pipeline of its own: one clip in, the motion of a known model out (``banmo retarget``).
+
+clip -> frames -> masks, flow, features -> onto (root poses on the known model) -> track (its codes) -> motion (files)
+
+It runs in a workspace of its own, so that it is kept, resumed and explained like everything else.
+"""
+
+PIPELINE = (
+    "stages.frames:frames",
+    "stages.masks:masks",
+    "stages.flow:flow",
+    "stages.features:features",
+    "stages.retarget:known",
+    "stages.retarget:onto",
+    "stages.retarget:track",
+    "stages.retarget_motion:motion",
+)
+
+PRESETS = "presets.toml"

@@ -1,0 +1,143 @@
+"""Root poses of a new clip on a known model: every way of looking at its known shapes, compared with the masks.
+
+Directions on a grid, articulations from the known clips, size and place from the mask's box; a smooth path through
+time. Silhouettes alone cannot tell near from far side: colours of the known surface, where the clip shows the same
+subject, weigh in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.fitting.observations import Observations
+from stages.geometry.cameras import project, transform
+from stages.geometry.rotations import geodesic_angle, matrix_to_quaternion, quaternion_to_matrix
+from stages.retargeting.articulation import best_sequence, mask_distance, misfit, spread
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Root poses (T, 4, 4) camera_from_object and how far to trust each (T,) in 0..1."""
+
+    poses: Tensor
+    confidence: Tensor
+
+
+def directions(azimuths: int = 24, elevations_deg: tuple[float, ...] = (-15.0, 0.0, 20.0, 45.0)) -> Tensor:
+    """Rotations (N, 3, 3), camera_from_object, of cameras all round an upright object (y up, OpenCV cameras)."""
+    found = []
+    for elevation in np.radians(elevations_deg):
+        for azimuth in 2 * np.pi * np.arange(azimuths) / azimuths:
+            back = np.array(
+                [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
+            )
+            right = np.cross(-back, (0.0, 1.0, 0.0))
+            right /= np.linalg.norm(right)
+            found.append(np.stack([right, np.cross(-back, right), -back]))
+    return torch.from_numpy(np.stack(found)).float()
+
+
+def place_in_box(shapes: Tensor, rotations: Tensor, box_px: Tensor, intrinsics: Tensor) -> Tensor:
+    """Poses (N, 4, 4) that put shapes (N, P, 3), turned by (N, 3, 3), into a mask's box (4,), x0 y0 x1 y1."""
+    turned = shapes @ rotations.transpose(1, 2)
+    low, high = turned.amin(1), turned.amax(1)
+    extent = (high - low)[:, :2].amax(1)
+    side = (box_px[2:] - box_px[:2]).amax().clamp_min(1.0)
+    focal = (intrinsics[0, 0] + intrinsics[1, 1]) / 2
+    depth = focal * extent / side
+    centre = (box_px[:2] + box_px[2:]) / 2
+    ray = (centre - intrinsics[:2, 2]) / torch.stack([intrinsics[0, 0], intrinsics[1, 1]])
+    middle = (low + high) / 2
+    pose = torch.eye(4).repeat(len(shapes), 1, 1)
+    pose[:, :3, :3] = rotations
+    target = torch.cat([ray[None] * depth[:, None], depth[:, None]], 1)
+    pose[:, :3, 3] = target - middle
+    pose[:, 2, 3] = depth - middle[:, 2]
+    return pose
+
+
+@torch.no_grad()
+def register(
+    shapes: Tensor, intrinsics: Tensor, observations: Observations, boxes_px: np.ndarray, every: int = 3
+) -> Placed:
+    """Root poses of all frames of one clip on shapes (A, P, 3) of a known model, object space.
+
+    Args:
+        intrinsics: (3, 3) pixels. boxes_px: (T, 4) of the masks.
+        every: one frame in so many is searched; the others are interpolated.
+    """
+    count = len(boxes_px)
+    chosen = spread(count, max(2, count // every))
+    chosen = chosen[observations.frame_weight[chosen] > 0]
+    if len(chosen) == 0:
+        raise ValueError("no frame shows the object")
+    look = directions()
+    rotations = look.repeat_interleave(len(shapes), 0)
+    candidates = shapes.repeat(len(look), 1, 1)
+    costs, poses = [], []
+    for frame in chosen.tolist():
+        box = torch.from_numpy(np.asarray(boxes_px[frame], np.float32))
+        pose = place_in_box(candidates, rotations, box, intrinsics)
+        cost = _one_frame(candidates, pose, intrinsics, observations, frame)
+        best = cost.reshape(len(look), len(shapes)).min(1)
+        costs.append(best.values)
+        poses.append(pose.reshape(len(look), len(shapes), 4, 4)[torch.arange(len(look)), best.indices])
+    cost = torch.stack(costs)
+    angle = geodesic_angle(look[:, None], look[None])
+    gap = float((chosen[1:] - chosen[:-1]).float().mean()) if len(chosen) > 1 else 1.0
+    path = best_sequence(cost, 0.08 * (angle / (0.12 * gap)).clamp_max(6.0))
+    picked = torch.stack([poses[i][int(k)] for i, k in enumerate(path)])
+    margin = cost.topk(min(8, cost.shape[1]), largest=False).values
+    trust = torch.exp(-4 * cost[torch.arange(len(path)), path]) * (0.5 + 0.5 * (margin[:, -1] > margin[:, 0] * 1.2))
+    every_frame = torch.arange(count)
+    return Placed(_between(picked, chosen, every_frame), _nearest(trust, chosen, every_frame))
+
+
+def _one_frame(
+    shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frame: int, chunk: int = 512
+) -> Tensor:
+    scale = float(observations.silhouette_scale[frame])
+    outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
+    height, width = outside.shape
+    far, some = torch.from_numpy(outside), torch.from_numpy(wanted)
+    size = max(8.0, float(np.sqrt((outside == 0).sum())))
+    found = []
+    for start in range(0, len(shapes), chunk):
+        points = transform(poses[start : start + chunk], shapes[start : start + chunk])
+        pixels = project(intrinsics, points) * scale
+        column = pixels[..., 0].floor().long().clamp(0, width - 1)
+        row = pixels[..., 1].floor().long().clamp(0, height - 1)
+        bare = torch.cdist(some[None].expand(len(pixels), -1, -1), pixels).amin(-1)
+        found.append((far[row, column].mean(1) + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size)
+    return torch.cat(found)
+
+
+def _between(poses: Tensor, known: Tensor, wanted: Tensor) -> Tensor:
+    """Rigid interpolation of poses at `known` frames to `wanted` ones, then smoothed over a few frames."""
+    right = torch.searchsorted(known, wanted).clamp(0, len(known) - 1)
+    left = (right - 1).clamp_min(0)
+    left = torch.where(known[right] == wanted, right, left)
+    span = (known[right] - known[left]).clamp_min(1)
+    share = ((wanted - known[left]).float() / span).clamp(0, 1)[:, None]
+    q = matrix_to_quaternion(poses[:, :3, :3])
+    for i in range(1, len(q)):
+        q[i] = torch.where((q[i] * q[i - 1]).sum() < 0, -q[i], q[i])
+    mixed = torch.nn.functional.normalize((1 - share) * q[left] + share * q[right], dim=-1)
+    shift = (1 - share) * poses[left, :3, 3] + share * poses[right, :3, 3]
+    weight = torch.exp(-0.5 * ((wanted[:, None] - wanted[None]).float() / 2.0).square())
+    weight = weight / weight.sum(1, keepdim=True)
+    result = torch.eye(4).repeat(len(wanted), 1, 1)
+    result[:, :3, :3] = quaternion_to_matrix(torch.nn.functional.normalize(weight @ mixed, dim=-1))
+    result[:, :3, 3] = weight @ shift
+    return result
+
+
+def _nearest(values: Tensor, known: Tensor, wanted: Tensor) -> Tensor:
+    return values[(wanted[:, None] - known[None]).abs().argmin(1)]
+
+
+__all__ = ["Placed", "directions", "misfit", "place_in_box", "register"]
