@@ -20,11 +20,13 @@ import numpy as np
 from stages.perception.appearance import ClipNetwork, PixelColours, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
 from stages.perception.optical_flow import Matcher, sample
+from stages.perception.outline import settle_outline
 from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
 CARRY_SIDE_PX = 128
+OUTLINE_REACH_PX = 4.0  # at the working size
 Tick = Callable[[int, int, str], None]
 
 
@@ -205,6 +207,7 @@ def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentati
     agreement = np.zeros(count)
     for t in range(count):
         prior = cv2.resize(steady[t], (width, height), interpolation=cv2.INTER_LINEAR)
+        prior = settle_outline(prior, images[t], OUTLINE_REACH_PX * max(1.0, max(width, height) / WORK_SIDE_PX))
         cut = main_component(prior > 0.5, prior)
         union = np.count_nonzero(cut | (prior > 0.25))
         agreement[t] = np.count_nonzero(cut & (prior > 0.75)) / max(union, 1)
