@@ -8,6 +8,8 @@ is stopped continues from its last checkpoint, bit for bit on a CPU.
 from __future__ import annotations
 
 import json
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection, collect
 from stages.fitting import initialise
+from stages.fitting.gauge import settle
 from stages.fitting.preview import preview_sheet
 from stages.fitting.schedule import PhaseSettings
+from stages.fitting.team import Team, joined
 from stages.fitting.trainer import Diverged, Trainer
 from stages.model.banmo import Architecture, Banmo
 
@@ -53,6 +57,8 @@ class FitSettings(PhaseSettings):
     """Fastest motion that the pose codes can follow."""
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
+    settle_root: bool = True
+    """At the end, move to the root poses what all bones share, so that the trunk rests in object space."""
     lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
 
@@ -221,46 +227,90 @@ def _run_phase(
     run: Run,
     label: str,
 ) -> None:
-    """Train from the last checkpoint to the end, and write the phase's folder."""
-    model.to(run.device)
-    trainer = Trainer(model, collection.observations, settings)
+    """Train from the last checkpoint to the end, and write the phase's folder.
+
+    Under torchrun's variables (``RANK``, ``WORLD_SIZE``, ``MASTER_ADDR``, ``MASTER_PORT``) the processes share every
+    step; all read the same checkpoint folder, and the first alone writes.
+    """
+    if run.world_size > settings.frames_per_step:
+        raise BadInput(
+            f"{run.world_size} processes for {settings.frames_per_step} frames a step",
+            hint="ask for fewer ranks, or raise frames_per_step",
+        )
+    device = _device(run)
+    with joined(run.rank, run.world_size, device) as team:
+        model, history = _train(model.to(device), collection, settings, checkpoints, run, team, label)
+    if not team.leads:
+        return
+    if isinstance(settings, FitSettings) and settings.settle_root:
+        run.metric("root_settled_deg", round(math.degrees(settle(model)), 3))
+    _write_folder(model.to("cpu"), collection, history, out)
+    for name, value in history[-1].items() if history else ():
+        if name != "step":
+            run.metric(f"loss_{name}", value)
+
+
+def _device(run: Run) -> str:
+    """Where this process computes: of several GPUs on a machine, each process takes its own."""
+    if run.device == "cuda" and run.world_size > 1:
+        return f"cuda:{int(os.environ.get('LOCAL_RANK', '0')) % torch.cuda.device_count()}"
+    return run.device
+
+
+def _train(
+    model: Banmo,
+    collection: Collection,
+    settings: PhaseSettings,
+    checkpoints: Checkpoints,
+    run: Run,
+    team: Team,
+    label: str,
+) -> tuple[Banmo, list[dict[str, float]]]:
+    """Train from the last checkpoint to the end; the leader of the team writes, all read. Returns the last metrics."""
+    device = model.base_poses.device
+    trainer = Trainer(model, collection.observations, settings, team)
     history: list[dict[str, float]] = []
     saved = checkpoints.latest()
     if saved is not None:
         trainer.restore(saved.tensors)
         history = saved.history
-    else:
-        checkpoints.save(trainer.state(), model.describe(), 0, history)
+    team.wait()  # until all have read the same checkpoint
     setbacks = 0
-    while not trainer.done:
-        if run.stop_requested:
+
+    def save() -> None:
+        if team.leads:
             checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
+
+    if saved is None:
+        save()
+    while not trainer.done:
+        if team.any(run.stop_requested, device):
+            save()
             run.interrupt()
         try:
             values = trainer.step()
         except Diverged as error:
             setbacks += 1
+            team.wait()  # until the leader's last checkpoint is in place
             saved = checkpoints.latest()
             if setbacks > 3 or saved is None:
                 raise
             run.warn(f"{error}; continued from step {saved.step} with half the step size")
             scale = trainer.rate_scale / 2
-            model = Banmo.restore(saved.model_tensors(), saved.description).to(run.device)
-            trainer = Trainer(model, collection.observations, settings)
+            model = Banmo.restore(saved.model_tensors(), saved.description).to(device)
+            trainer = Trainer(model, collection.observations, settings, team)
             trainer.restore(saved.tensors)
             trainer.rate_scale, history = scale, saved.history
+            team.wait()
             continue
         if trainer.step_idx % _METRIC_STEPS == 0 or trainer.done:
             history.append({"step": trainer.step_idx, **{k: round(v, 7) for k, v in values.items()}})
         run.tick(trainer.step_idx, settings.iterations, label, loss=values["total"])
         if trainer.step_idx % _CHECKPOINT_STEPS == 0 and not trainer.done:
-            checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
-            if run.device == "cpu":
+            save()
+            if team.leads and run.device == "cpu":
                 _write_preview(model, collection, checkpoints.root / "preview.png")
-    _write_folder(model.to("cpu"), collection, history, out)
-    for name, value in history[-1].items() if history else ():
-        if name != "step":
-            run.metric(f"loss_{name}", value)
+    return model, history
 
 
 def _write_folder(model: Banmo, collection: Collection, history: list[dict[str, float]], out: Path) -> None:

@@ -28,6 +28,28 @@ class Batch(NamedTuple):
         """The same batch on another device."""
         return Batch(*(None if x is None else x.to(device, non_blocking=True) for x in self))
 
+    def of(self, part: slice) -> Batch:
+        """Some frames of the batch."""
+        return Batch(*(None if x is None else x[part] for x in self))
+
+
+class Draws:
+    """The random numbers of a step for `part` of a batch of `frames` frames.
+
+    They are drawn for the whole batch and then cut, so that a frame gets the same ones whoever renders it.
+    """
+
+    def __init__(self, generator: torch.Generator, frames: int, part: slice, device: torch.device) -> None:
+        self.generator, self.frames, self.part, self.device = generator, frames, part, device
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Numbers in 0..1 of `shape` for each frame of the part."""
+        return torch.rand(self.frames, *shape, generator=self.generator)[self.part].to(self.device)
+
+    def below(self, high: int, *shape: int) -> Tensor:
+        """Integers in 0..high - 1 of `shape` for each frame of the part."""
+        return torch.randint(high, (self.frames, *shape), generator=self.generator)[self.part].to(self.device)
+
 
 def step_generator(seed: int, step: int, rank: int = 0) -> torch.Generator:
     """The source of every random draw of one step."""

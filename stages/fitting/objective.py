@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from stages.fitting.batches import Batch
+from stages.fitting.batches import Batch, Draws
 from stages.fitting.schedule import PhaseSettings
+from stages.fitting.team import ALONE, Team
 from stages.geometry.cameras import pixel_directions, project, ray_box, transform
 from stages.geometry.rotations import so3_log
 from stages.model import losses, rendering
@@ -44,11 +45,12 @@ def render(
     pixels: Tensor,
     beta: float,
     settings: PhaseSettings,
-    generator: torch.Generator | None,
+    draws: Draws | None,
 ) -> Rendered:
     """Volume-render `pixels` (F, P, 2) through per-frame object-space boxes (F, 2, 3) (equations 2, 3).
 
-    A probe without gradient finds the surface; a few samples with gradient are drawn where its weight lies.
+    A probe without gradient finds the surface; a few samples with gradient are drawn where its weight lies. `draws`
+    jitters both; without it samples lie in the middle of their strata.
     """
     frames, count = pixels.shape[:2]
     offset = rendering.edge_offset(beta)
@@ -56,9 +58,7 @@ def render(
     near, far, _ = ray_box(origins, directions, boxes[:, None, 0], boxes[:, None, 1])
 
     def draw(samples: int) -> Tensor | None:
-        if generator is None:
-            return None
-        return torch.rand(frames * count, samples, generator=generator).to(pixels.device)
+        return None if draws is None else draws.uniform(count, samples).reshape(-1, samples)
 
     def warp(depths: Tensor) -> tuple[Tensor, Tensor]:
         samples = depths.shape[1]
@@ -109,14 +109,24 @@ def evaluate(
     beta: float,
     step: int,
     generator: torch.Generator,
+    team: Team = ALONE,
 ) -> dict[str, Tensor]:
-    """Every active term of the objective, already weighted; their sum is minimised."""
+    """Every active term of the objective, already weighted; their sum is minimised.
+
+    In a team each process answers for its frames of the batch: the terms, and their gradients, add up to those of
+    one process alone.
+    """
     prepared = model.field.prepare()
+    part = team.part(len(batch.frame_idx))
+    draws = Draws(generator, len(batch.frame_idx), part, batch.pixels.device)
+    has_flow = bool(batch.flow_confidence.any())
+    share = (part.stop - part.start) / len(batch.frame_idx)
+    batch = batch.of(part)
     frames = len(batch.frame_idx)
     both = model.frames(torch.cat([batch.frame_idx, batch.partner_idx]))
     state = FrameState(*(x if len(x) == 1 else x[:frames] for x in both))
     partner = FrameState(*(x if len(x) == 1 else x[frames:] for x in both))
-    seen = render(model, prepared, state, boxes[batch.frame_idx], batch.pixels, beta, settings, generator)
+    seen = render(model, prepared, state, boxes[batch.frame_idx], batch.pixels, beta, settings, draws)
     opacity = seen.opacity.detach()
     inside = (batch.mask > 0.5).float() * batch.weight
     terms: dict[str, Tensor] = {}
@@ -129,25 +139,28 @@ def evaluate(
         add("silhouette", settings.weight_silhouette, losses.silhouette_loss(seen.opacity, batch.mask, weight))
     if settings.weight_rgb:
         add("rgb", settings.weight_rgb, losses.colour_loss(seen.colour, batch.rgb, inside * opacity))
-    if settings.weight_flow and batch.flow_confidence.any():
+    if settings.weight_flow and has_flow:
         moved = transform(partner.camera_from_object, model.forward_points(partner, seen.surface))
         flow = project(partner.intrinsics, moved) - batch.pixels
         weight = batch.flow_confidence * inside * opacity
         add("flow", settings.weight_flow, losses.flow_loss(flow, batch.flow, weight))
     if batch.features is not None:
-        terms.update(_correspondence(model, state, batch, seen, inside * opacity, settings, step, generator))
+        terms.update(_correspondence(model, state, batch, seen, inside * opacity, settings, step, draws))
     if settings.weight_cycle_3d:
-        terms["cycle_3d"] = settings.weight_cycle_3d * _cycle_3d(model, state, seen, generator)
-    terms.update(_shape_terms(model, prepared, settings, step))
-    terms.update(motion_terms(model, batch.frame_idx, settings, generator))
+        terms["cycle_3d"] = settings.weight_cycle_3d * _cycle_3d(model, state, seen, draws)
+    terms.update(motion_terms(model, batch.frame_idx, settings))
+    if team.size > 1:
+        terms = {name: share * value for name, value in terms.items()}
+    for name, value in _shape_terms(model, prepared, settings, step).items():
+        terms[name] = value / team.size
     return terms
 
 
-def _cycle_3d(model: Banmo, state: FrameState, seen: Rendered, generator: torch.Generator) -> Tensor:
+def _cycle_3d(model: Banmo, state: FrameState, seen: Rendered, draws: Draws) -> Tensor:
     """3D cycle on two samples a ray: the heaviest and a random one."""
     frames, count, samples = seen.weights.shape
     heavy = seen.weights.argmax(-1, keepdim=True)
-    other = torch.randint(samples, heavy.shape, generator=generator).to(heavy.device)
+    other = draws.below(samples, count, 1)
     index = torch.cat([heavy, other], -1)
     wide = index[..., None].expand(-1, -1, -1, 3)
     canonical = seen.canonical.gather(2, wide).reshape(frames, -1, 3)
@@ -165,7 +178,7 @@ def _correspondence(
     weight: Tensor,
     settings: PhaseSettings,
     step: int,
-    generator: torch.Generator,
+    draws: Draws,
 ) -> dict[str, Tensor]:
     """Rendered embedding, match and 2D cycle. The embedding learns from the first; the cycle moves only the warps."""
     assert batch.features is not None
@@ -179,8 +192,8 @@ def _correspondence(
     if not wanted or step % max(1, settings.match_every) or len(model.surface) == 0:
         return terms
     frames, count = batch.mask.shape
-    per_frame = max(1, settings.match_pixels // frames)
-    pick = torch.randint(count, (frames, per_frame), generator=generator).to(known.device)
+    per_frame = max(1, settings.match_pixels // draws.frames)
+    pick = draws.below(count, per_frame)
     surface = model.surface
     low, high = surface.amin(0), surface.amax(0)
     grid = match_grid(torch.stack([low, high]))
@@ -234,9 +247,7 @@ def _shape_terms(model: Banmo, prepared: Tensor, settings: PhaseSettings, step: 
     return terms
 
 
-def motion_terms(
-    model: Banmo, frame_idx: Tensor, settings: PhaseSettings, generator: torch.Generator
-) -> dict[str, Tensor]:
+def motion_terms(model: Banmo, frame_idx: Tensor, settings: PhaseSettings) -> dict[str, Tensor]:
     """Regularisers of the motion: joints hold together, bones and roots do not jerk."""
     terms: dict[str, Tensor] = {}
     last = len(model.time) - 1

@@ -6,6 +6,8 @@ Resuming is exact: all randomness comes from (seed, step), and everything a step
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,7 @@ from stages.fitting.observations import Observations
 from stages.fitting.renew import renew_bones, renew_bounds
 from stages.fitting.schedule import PhaseSettings, beta_at, rate_at
 from stages.fitting.surface import frame_boxes, surface_points
+from stages.fitting.team import ALONE, Team
 from stages.model.banmo import Banmo
 
 
@@ -29,11 +32,12 @@ class Diverged(RuntimeError):
 class Trainer:
     """One phase of the optimisation of `model` on `observations`."""
 
-    def __init__(self, model: Banmo, observations: Observations, settings: PhaseSettings) -> None:
-        self.model, self.observations, self.settings = model, observations, settings
+    def __init__(self, model: Banmo, observations: Observations, settings: PhaseSettings, team: Team = ALONE) -> None:
+        self.model, self.observations, self.settings, self.team = model, observations, settings, team
         self.step_idx = 0
         self.rate_scale = 1.0
         model.use_delta = model.use_delta or settings.delta_from <= 0
+        self._agree()
         self.refresh()
         self.optimiser = self._optimiser()
 
@@ -85,10 +89,10 @@ class Trainer:
 
     def refresh(self) -> None:
         """Extract the surface anew and each frame's box around it: near and far planes, matching bounds."""
-        points = surface_points(self.model)
+        points = self.team.agree(surface_points(self.model).to(self.device))
         if len(points) >= 100:
-            self.model.surface = points.to(self.device)
-        self.boxes = frame_boxes(self.model)
+            self.model.surface = points
+        self.boxes = self.team.agree(frame_boxes(self.model))
 
     def step(self) -> dict[str, float]:
         """One step of descent; returns the weighted value of each term.
@@ -105,13 +109,16 @@ class Trainer:
         generator = step_generator(s.seed, self.step_idx)
         batch = draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator).to(self.device)
         beta = max(beta_at(s, self.progress), model.beta_floor)
-        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator)
+        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator, self.team)
         total = torch.stack(list(terms.values())).sum()
-        if not torch.isfinite(total):
-            broken = next((name for name, value in terms.items() if not torch.isfinite(value)), "total")
-            raise Diverged(self.step_idx, broken)
+        whole = torch.stack([value.detach() for value in terms.values()])
+        self.team.sum([whole])
+        values = dict(zip(terms, whole.tolist(), strict=True))
+        if not torch.isfinite(whole).all():
+            raise Diverged(self.step_idx, next(n for n, v in values.items() if not math.isfinite(v)))
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
+        self._share_gradients()
         rate = rate_at(s, self.step_idx) * self.rate_scale
         frozen = self.progress < s.sdf_frozen_until
         for group in self.optimiser.param_groups:
@@ -119,9 +126,18 @@ class Trainer:
             torch.nn.utils.clip_grad_norm_(group["params"], 10.0)
         self.optimiser.step()
         self.step_idx += 1
-        values = {name: float(value.detach()) for name, value in terms.items()}
-        values["total"] = float(total.detach())
+        values["total"] = sum(values.values())
         return values
+
+    def _agree(self) -> None:
+        """Take the leader's weights: what processes compute alone may differ in the last digit between machines."""
+        for tensor in (*self.model.parameters(), *self.model.buffers()):
+            tensor.data = self.team.agree(tensor.data)
+
+    def _share_gradients(self) -> None:
+        """Sum gradients over the team. Every process has the same terms, so the same parameters have one."""
+        groups = self.optimiser.param_groups
+        self.team.sum([p.grad for group in groups for p in group["params"] if p.grad is not None])
 
     def _renew(self) -> None:
         """Bones and box anew on the shape as it is now; the optimiser starts afresh, as the parameters are new."""
@@ -130,6 +146,7 @@ class Trainer:
             return
         renew_bounds(self.model, margin=0.2)
         renew_bones(self.model, self.settings.seed + self.step_idx)
+        self._agree()
         self.refresh()
         self.optimiser = self._optimiser()
 

@@ -159,10 +159,10 @@ def test_untrusted_frames_pull_nowhere(seen: Scene) -> None:
 def test_motion_terms_of_rest_and_of_jerks(seen: Scene) -> None:
     model, _ = ready(model_of(seen, ball))
     frames = torch.arange(6)
-    rest = objective.motion_terms(model, frames, FINE, step_generator(0, 0))
+    rest = objective.motion_terms(model, frames, FINE)
     assert all(float(rest[name].detach()) < 2e-3 for name in ("joints", "motion") if name in rest)
     stir(model, 0.8)
-    wild = objective.motion_terms(model, frames, FINE, step_generator(0, 0))
+    wild = objective.motion_terms(model, frames, FINE)
     assert all(float(wild[name].detach()) > 5 * float(rest[name].detach()) for name in ("joints", "motion"))
 
 
