@@ -39,6 +39,7 @@ _VERBS: dict[str, tuple[str, str, tuple[str, ...]]] = {
             "banmo run --until masks            only as far as the masks",
             "banmo run --redo fit               again, although it is up to date",
             "banmo run --skip-video cat-03      without one clip",
+            "banmo run --executor slurm         on a cluster",
         ),
     ),
     "status": ("show", "a table of stages and videos", ("banmo status", "banmo status --json")),
@@ -188,6 +189,7 @@ def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
         add("--video", action="append", default=[], metavar="VIDEO", help="only the stages of this video")
         add("-n", "--dry-run", action="store_true", help="say what would run, and stop")
         add("--check", action="store_true", help="as -n, and exit 10 when there is work")
+        add("--executor", choices=("local", "slurm"), help="where to run; short for --execution.executor")
         add("--fail-fast", action="store_true", help="stop everything at the first failure")
     if name in ("why", "inspect", "log", "bless"):
         add("stage", metavar="STAGE")
@@ -219,6 +221,8 @@ def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
 
 def options_of(args: argparse.Namespace, overrides: list[tuple[str, str]]) -> Options:
     """The options all commands share."""
+    if getattr(args, "executor", None):
+        overrides = [*overrides, ("execution.executor", args.executor)]
     return Options(
         workspace=args.workspace,
         definition=getattr(args, "definition", ""),

@@ -58,11 +58,15 @@ class Resources:
     """What an action holds while it runs. Never part of its key.
 
     ``cpus="all"`` (or 0) takes every core of the machine; ``gpus`` are used where the machine has them, and the
-    stage runs on the CPU where it has none.
+    stage runs on the CPU where it has none. ``distributed=True`` says that the stage can be started in several
+    processes (``[execution] ranks``), which find torch's RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT in
+    their environment; `cpus` is then shared among them, `gpus` is for each. All read the same checkpoint folder; what
+    ranks other than 0 write to ``out`` is thrown away. The wish to stop may reach them at different steps: agree first.
     """
 
     cpus: int | str = 1
     gpus: int = 0
+    distributed: bool = False
 
     def __post_init__(self) -> None:
         if not (self.cpus == "all" or (isinstance(self.cpus, int) and self.cpus >= 0)) or self.gpus < 0:

@@ -58,6 +58,7 @@ def describe(reference: str) -> dict[str, Any]:
         "data": list(found.data),
         "cpus": found.needs.cores,
         "gpus": found.needs.gpus,
+        "distributed": found.needs.distributed,
         "inputs": list(found.inputs),
         "takes": [p for p in ("video", "given", "settings") if p in found.parameters],
         "doc": inspect.getdoc(found.function) or "",

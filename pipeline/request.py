@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipeline.executor import Grant
 from pipeline.files import read_json
 from pipeline.graph import Node
 from pipeline.plan import Planner, Step
@@ -11,8 +12,8 @@ from pipeline.settings import stage_values
 from pipeline.videos import VideoFile, state_of
 
 
-def build_request(planner: Planner, step: Step, run: str, cpus: int, gpus: list[str]) -> dict[str, Any]:
-    """The request for a step whose action is known, to run on the granted cores and GPUs."""
+def build_request(planner: Planner, step: Step, run: str, grant: Grant) -> dict[str, Any]:
+    """The request for a step whose action is known, to run on what was granted."""
     node, info = step.node, step.node.info
     assert step.action is not None and info.code is not None
     takes_sources = "video" in info.takes or "given" in info.takes
@@ -35,8 +36,8 @@ def build_request(planner: Planner, step: Step, run: str, cpus: int, gpus: list[
         "supersedes": step.record.finished if step.record and node in planner.forced else None,
         "spent_s": _spent_before(planner, step.action.key),
         "run": run,
-        "device": "cuda" if gpus else "cpu",
-        "threads": cpus,
+        "device": "cuda" if grant.gpus else "cpu",
+        "threads": grant.threads,
         "grace_s": planner.settings.execution.grace_s,
         "watch_parent": True,
     }

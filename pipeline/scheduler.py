@@ -11,10 +11,10 @@ from types import FrameType
 from typing import Any
 
 from pipeline.errors import BadInput
+from pipeline.executor import Executor, Grant, Job, Launch, Outcome, silent_after
 from pipeline.files import remove_tree, write_json
 from pipeline.graph import Node
 from pipeline.guard import needs_decision
-from pipeline.local import Job, Outcome, Tokens
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
 from pipeline.request import build_request
 from pipeline.runs import RunFolder
@@ -32,13 +32,13 @@ class Scheduler:
         planner: Planner,
         steps: list[Step],
         folder: RunFolder,
-        tokens: Tokens,
+        executor: Executor,
         display: Display,
         *,
         fail_fast: bool = False,
         on_result: Callable[[Node], None] | None = None,
     ) -> None:
-        self.planner, self.folder, self.tokens, self.display = planner, folder, tokens, display
+        self.planner, self.folder, self.executor, self.display = planner, folder, executor, display
         self.fail_fast = fail_fast
         self.on_result = on_result
         self.workspace = planner.workspace
@@ -50,6 +50,7 @@ class Scheduler:
         self._order = {node.label: i for i, node in enumerate(planner.graph.nodes)}
         self._seen_results = (-1, -1)
         self._signals = 0
+        self._left = False
         self._grace_s = planner.settings.execution.grace_s
         for step in steps:
             if step.status == HIT:
@@ -60,7 +61,7 @@ class Scheduler:
         clock = time.monotonic()
         previous = {n: signal.signal(n, self._on_signal) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
         try:
-            while self._jobs or ((self._ready or self._waiting) and not self._stopping()):
+            while (self._jobs and not self._left) or ((self._ready or self._waiting) and not self._stopping()):
                 self._decide_waiting()
                 self._launch()
                 self._collect()
@@ -69,8 +70,9 @@ class Scheduler:
                     break
                 time.sleep(_POLL_S)
         finally:
-            for job in self._jobs.values():
-                job.kill()
+            if not self.executor.survives:
+                for job in self._jobs.values():
+                    job.kill()
             for number, handler in previous.items():
                 signal.signal(number, handler)
         self.report.not_started = [n.label for n in (*self._ready, *self._waiting)]
@@ -137,36 +139,65 @@ class Scheduler:
         if self._stopping():
             return
         busy = {self._key(n) for n in self._jobs}
+        launches: list[Launch] = []
         for node in sorted(self._ready, key=lambda n: self._order[n.label]):
             if self._key(node) in busy or self._made_meanwhile(node):
                 continue  # the same action under another video's name
-            granted = self.tokens.take(node.info.cpus, node.info.gpus)
-            if granted is None:
+            grant = self.executor.take(node.info)
+            if grant is None:
                 continue
             busy.add(self._key(node))
             self._ready.remove(node)
             try:
-                self._start(node, *granted)
+                launch = self._prepare(node, grant)
             except BadInput as error:
-                self.tokens.give_back(*granted)
+                self.executor.give_back(grant)
                 self._refuse(node, error)
+                continue
+            if launch is not None:
+                launches.append(launch)
+        for stage in dict.fromkeys(launch.node.info.name for launch in launches):
+            self._start([launch for launch in launches if launch.node.info.name == stage])
 
-    def _start(self, node: Node, cpus: int, gpus: list[str]) -> None:
-        """Start a worker; if what it reads has changed since the plan was made, decide the node anew instead."""
+    def _prepare(self, node: Node, grant: Grant) -> Launch | None:
+        """An attempt; None when what it reads has changed since the plan was made: then it is decided anew."""
         step = self._steps[node.label]
-        request = build_request(self.planner, step, self.folder.id, cpus, gpus)
+        request = build_request(self.planner, step, self.folder.id, grant)
         if self.planner.action(node).key != self._key(node):
-            self.tokens.give_back(cpus, gpus)
+            self.executor.give_back(grant)
             self._waiting.append(node)
             self._seen_results = (-1, -1)
-            return
+            return None
         if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
             self.workspace.objects.set_aside(node.info.name, step.record.digest)
         attempt = self.workspace.tmp / f"try-{self.folder.id}-{secrets.token_hex(4)}"
-        attempt.mkdir(parents=True)
-        write_json(attempt / "request.json", request)
-        self._jobs[node] = Job(attempt, request, self.folder.log_path(node), cpus, gpus)
-        self._tell(node, {"event": "launched", "reasons": [r.as_json() for r in step.reasons]})
+        return Launch(node, attempt, request, self.folder.log_path(node), grant)
+
+    def _start(self, launches: list[Launch]) -> None:
+        """Start attempts of one stage, or go on with those that an earlier run left at work."""
+        fresh: list[Launch] = []
+        for launch in launches:
+            earlier = self.executor.reattach(launch)
+            if earlier is None:
+                fresh.append(launch)
+                continue
+            self._jobs[launch.node] = earlier
+            self._tell(launch.node, {"event": "launched", "text": "goes on from an earlier run"})
+        try:
+            for launch in fresh:
+                launch.attempt.mkdir(parents=True)
+                write_json(launch.attempt / "request.json", launch.request)
+            jobs = self.executor.start(fresh) if fresh else []
+        except BadInput as error:
+            for launch in fresh:
+                self.executor.give_back(launch.grant)
+                remove_tree(launch.attempt)
+                self._refuse(launch.node, error)
+            return
+        for launch, job in zip(fresh, jobs, strict=True):
+            self._jobs[launch.node] = job
+            reasons = [r.as_json() for r in self._steps[launch.node.label].reasons]
+            self._tell(launch.node, {"event": "launched", "reasons": reasons})
 
     def _refuse(self, node: Node, error: BadInput) -> None:
         """What a node reads has become unreadable under way: it fails, the others go on."""
@@ -193,25 +224,25 @@ class Scheduler:
         for node, job in list(self._jobs.items()):
             outcome = job.poll()
             for event in job.events.read():
-                job.last_sign = time.monotonic()
+                job.watched.last_sign = time.monotonic()
                 self._tell(node, {k: v for k, v in event.items() if k != "label"})
             if outcome is None:
                 self._mind_silence(node, job)
                 continue
             del self._jobs[node]
-            self.tokens.give_back(job.cpus, job.gpus)
+            self.executor.give_back(job.watched.grant)
             self._finish(node, job, outcome)
-            remove_tree(job.attempt)
+            remove_tree(job.watched.attempt)
 
     def _mind_silence(self, node: Node, job: Job) -> None:
         """Say so, once, when a worker has given no sign of life for long; only the user knows whether it hangs."""
-        if not job.told_silent and time.monotonic() - job.last_sign > _SILENT_S:
-            job.told_silent = True
+        if not job.watched.told_silent and silent_after(job) > _SILENT_S:
+            job.watched.told_silent = True
             text = f"no progress for {_SILENT_S / 60:.0f} min; `banmo log {node.label.replace('/', ' ')}` may tell why"
             self._tell(node, {"event": "silent", "text": text})
 
     def _finish(self, node: Node, job: Job, outcome: Outcome) -> None:
-        seconds = round(time.monotonic() - job.started, 2)
+        seconds = round(time.monotonic() - job.watched.started, 2)
         note = self.workspace.attempts / f"{self._key(node)}.json"
         if outcome.status == "done":
             record = self.workspace.ledger.find(node.info.name, self._key(node))
@@ -225,7 +256,7 @@ class Scheduler:
                 note.unlink(missing_ok=True)
                 self._result(node, record.digest)
         if outcome.status != "done":
-            spent = seconds + job.spent_s if outcome.status == "interrupted" else 0.0
+            spent = seconds + job.watched.spent_s if outcome.status == "interrupted" else 0.0
             if outcome.status == "interrupted" and not self._stopping():
                 outcome = Outcome("failed", outcome.message + " although nobody asked")
             write_json(
@@ -233,7 +264,7 @@ class Scheduler:
                 {
                     "status": outcome.status,
                     "message": outcome.message,
-                    "log": os.path.relpath(job.log_path, self.workspace.root),
+                    "log": os.path.relpath(job.watched.log_path, self.workspace.root),
                     "label": node.label,
                     "spent_s": spent,
                     "time": time.time(),
@@ -247,7 +278,7 @@ class Scheduler:
                 self.report.failed[node.label] = outcome.message
             if self.fail_fast:
                 self._ask_all_to_stop()
-        log = os.path.relpath(job.log_path, self.workspace.root)
+        log = os.path.relpath(job.watched.log_path, self.workspace.root)
         self._tell(node, {"event": outcome.status, "text": outcome.message, "seconds": seconds, "log": log})
 
     def _key(self, node: Node) -> str:
@@ -274,7 +305,9 @@ class Scheduler:
     def _on_signal(self, number: int, _frame: FrameType | None) -> None:
         self._signals += 1
         self.report.stopped_by = self.report.stopped_by or number
-        if self._signals == 1:
+        if number == signal.SIGHUP and self.executor.survives:
+            self._left = True  # the terminal is gone, the jobs are not: the next run finds them
+        elif self._signals == 1:
             self.display.event("", {"event": "stopping"})
             self._ask_all_to_stop()
         else:

@@ -10,7 +10,7 @@ import os
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.definition import Definition, StageInfo, read_toml
 from pipeline.describe import fields_of
@@ -45,6 +45,24 @@ class ExecutionSection:
     """Seconds a worker has to save its work when asked to stop, before it is killed."""
     keep_runs: int = 5
     """Runs whose results `gc` keeps."""
+    executor: Literal["local", "slurm"] = "local"
+    """Where to run: this machine, or a Slurm cluster (needs the extra `slurm`)."""
+    ranks: int = 1
+    """Processes that share the work of a stage which trains in parallel."""
+    nodes: int = 1
+    """Slurm: nodes over which these ranks are spread."""
+    slurm_partition: str = ""
+    """Slurm: partition; "" leaves it to the cluster."""
+    slurm_account: str = ""
+    """Slurm: account to charge."""
+    slurm_qos: str = ""
+    """Slurm: quality of service."""
+    slurm_time_limit_min: int = 720
+    """Slurm: time limit of a job; what it could not finish is requeued and goes on from its checkpoint."""
+    slurm_memory_gb: float = 0.0
+    """Slurm: memory of a job on each node; 0 leaves it to the cluster."""
+    slurm_parallel: int = 64
+    """Slurm: jobs of one array that run at the same time."""
 
 
 _OWN: dict[str, type] = {"pipeline": PipelineSection, "execution": ExecutionSection}

@@ -28,6 +28,7 @@ from pipeline.errors import BadInput, ExitCode, Interrupted, PipelineError, Stag
 from pipeline.events import EventWriter
 from pipeline.files import failpoint, read_json, remove_tree, write_json
 from pipeline.ledger import Record
+from pipeline.ranks import Ranks
 from pipeline.running import Run
 from pipeline.source import CodeReader
 from pipeline.videos import state_of
@@ -46,14 +47,19 @@ def main(argv: list[str]) -> int:
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname).1s %(message)s", datefmt="%H:%M:%S"
     )
-    return Worker(request, request_path.parent).run()
+    ranks = Ranks.from_environment()
+    attempt = request_path.parent
+    return Worker(request, attempt, ranks).run()
 
 
 class Worker:
-    """One attempt at one action. `attempt` is its scratch folder."""
+    """One attempt at one action, or one rank of it. `attempt` is the scratch folder of all its ranks."""
 
-    def __init__(self, request: dict[str, Any], attempt: Path) -> None:
-        self.request, self.attempt = request, attempt
+    def __init__(self, request: dict[str, Any], attempt: Path, ranks: Ranks | None = None) -> None:
+        self.request, self.meeting = request, attempt
+        self.ranks = ranks or Ranks()
+        self.attempt = attempt / f"rank-{self.ranks.rank}" if self.ranks.rank else attempt
+        self.attempt.mkdir(parents=True, exist_ok=True)
         self.workspace = Workspace(Path(request["workspace"]))
         self.events = EventWriter(attempt / "events.jsonl", {"label": request["label"]})
         self.context = Run(
@@ -62,6 +68,8 @@ class Worker:
             videos=tuple(request["videos"]),
             device=request["device"],
             threads=request["threads"],
+            rank=self.ranks.rank,
+            world_size=self.ranks.world_size,
             sink=self.events,
             log=logging.getLogger(request["stage"]),
         )
@@ -83,7 +91,10 @@ class Worker:
 
     def _guarded(self) -> tuple[str, str, int]:
         try:
-            self._run_leased()
+            if self.ranks.rank:
+                self._assist()
+            else:
+                self._run_leased()
             return "done", "", ExitCode.DONE
         except Interrupted:
             log.info("stopped on request; checkpoints are kept")
@@ -132,6 +143,7 @@ class Worker:
             if existing is not None and self._serves(existing):
                 log.info("another run has made this meanwhile")
                 self.record = existing
+                self.ranks.call(self.meeting, work=False)
                 return
             self._make()
         finally:
@@ -142,15 +154,31 @@ class Worker:
             return False  # this is the one that the user wants made again
         return self.workspace.objects.sound(record.stage, record.digest)
 
+    def _assist(self) -> None:
+        """A rank other than 0: run the stage with rank 0, and throw away what it writes."""
+        if not self.ranks.follow(self.meeting, lambda: self.context.stop_requested):
+            return
+        out = self._fresh_out()
+        found = load_stage(self.request["reference"])
+        self._same_code()
+        found.function(**bind(found, found.function, self._arguments(found, out)))
+        remove_tree(out)
+
+    def _fresh_out(self) -> Path:
+        out = self.attempt / "out"
+        remove_tree(out)  # of a launch of this attempt that was cut short and requeued
+        out.mkdir()
+        return out
+
     def _make(self) -> None:
         request = self.request
         started = datetime.now(UTC)
         clock = time.monotonic()
         self.events({"event": "started", "pid": os.getpid()})
-        out = self.attempt / "out"
-        out.mkdir()
+        out = self._fresh_out()
         found = load_stage(request["reference"])
         self._same_code()
+        self.ranks.call(self.meeting, work=True)
         known = self._arguments(found, out)
         found.function(**bind(found, found.function, known))
         for check in found.checks:

@@ -10,6 +10,7 @@
     checkpoints/<key>/     unfinished work
     tmp/<attempt>/         scratch
     leases/ cache/         locks and memos; both may be removed while nothing runs
+    jobs/<key>.json        the cluster's job that works on an action
     FORMAT                 1
 """
 
@@ -43,6 +44,7 @@ class Workspace:
         self.cache = self.root / "cache"
         self.checkpoints = self.root / "checkpoints"
         self.leases = self.root / "leases"
+        self.jobs = self.root / "jobs"
         self.exports = self.root / "exports"
         self.attempts = self.cache / "attempts"
         self.settings_path = self.root / "pipeline.toml"
@@ -153,11 +155,19 @@ class Workspace:
         """Remove scratch of attempts that nobody works on any more (their lock is free and so is their run's)."""
         if not self.tmp.is_dir():
             return
+        queued = self.attempts_of_jobs()
         for attempt in self.tmp.iterdir():
             run = re.match(r"try-(.+)-[0-9a-f]{8}$", attempt.name)
-            if run is None or self.held(attempt / "alive.lock") or self.held(self.leases / f"run-{run[1]}.lock"):
+            if run is None or attempt.name in queued:
+                continue
+            if self.held(attempt / "alive.lock") or self.held(self.leases / f"run-{run[1]}.lock"):
                 continue
             remove_tree(attempt)
+
+    def attempts_of_jobs(self) -> set[str]:
+        """Names of the attempts that wait or run on a cluster."""
+        notes = [read_json(p) for p in self.jobs.glob("*.json")] if self.jobs.is_dir() else []
+        return {str(n.get("attempt")) for n in notes if isinstance(n, dict)}
 
     def free_bytes(self) -> int:
         """Bytes an ordinary user may still write."""

@@ -14,10 +14,11 @@ from typing import Any
 
 from pipeline.console import PlainDisplay, duration, print_plan
 from pipeline.errors import ExitCode
+from pipeline.executor import Executor
 from pipeline.exports import export
 from pipeline.graph import Selection
 from pipeline.guard import decision, needs_decision
-from pipeline.local import Tokens, machine_cpus, machine_gpus
+from pipeline.local import LocalExecutor, Tokens, machine_cpus, machine_gpus
 from pipeline.plan import HIT, Planner, Step
 from pipeline.preflight import check_disk
 from pipeline.project import Options, Project
@@ -106,10 +107,7 @@ def _execute(
     try:
         folder.write_plan(plan_json(steps), to_toml(project.settings))
         folder.make_latest()
-        execution = project.settings.execution
-        cpus = min(execution.cpus or machine_cpus(), machine_cpus())
-        gpus = machine_gpus() if any(s.node.info.gpus for s in pending) else []
-        gpus = gpus if execution.gpus < 0 else gpus[: execution.gpus]
+        executor, cpus = _executor(project, folder, pending)
         with contextlib.ExitStack() as stack:
             display: Any = PlainDisplay(out)
             if out.isatty():
@@ -117,7 +115,7 @@ def _execute(
 
                 expected = {s.node.label: s.record.seconds for s in steps if s.record}
                 display = stack.enter_context(LiveDisplay(steps, expected, cpus))
-            scheduler = Scheduler(planner, steps, folder, Tokens(cpus, gpus), display, fail_fast=flags.fail_fast)
+            scheduler = Scheduler(planner, steps, folder, executor, display, fail_fast=flags.fail_fast)
             report = scheduler.run()
         folder.write_plan(plan_json([planner.steps[s.node.label] for s in steps], planner), to_toml(project.settings))
     finally:
@@ -126,6 +124,19 @@ def _execute(
     if len(report.done) + len(report.hits) == len(steps) and selection.is_everything():
         exported = export(project, planner)
     return _conclude(report, exported, time.monotonic() - clock)
+
+
+def _executor(project: Project, folder: RunFolder, pending: list[Step]) -> tuple[Executor, int]:
+    """Where to run, and with how many cores at once."""
+    execution = project.settings.execution
+    if execution.executor == "slurm":
+        from pipeline.slurm import SlurmExecutor
+
+        return SlurmExecutor(project.workspace, execution, folder.path), max(1, execution.slurm_parallel)
+    cpus = min(execution.cpus or machine_cpus(), machine_cpus())
+    gpus = machine_gpus() if any(s.node.info.gpus for s in pending) else []
+    gpus = gpus if execution.gpus < 0 else gpus[: execution.gpus]
+    return LocalExecutor(Tokens(cpus, gpus), execution.ranks), cpus
 
 
 def plan_json(steps: list[Step], planner: Planner | None = None) -> dict[str, Any]:
