@@ -2,10 +2,16 @@
 
 The folder::
 
-    model.glb                   surface, texture, skin, joints in a tree, a clip a video, root motion apart, cameras
+    model.glb                   surface, texture, skin, joints in a tree, a clip a video, root motion apart, cameras;
+                                attribute ``_SEEN`` is the share of the frames that saw each vertex
+    model.usdz                  the same for phones and USD programs, a variant a clip, motion in place
     rest.ply                    the surface at rest; property ``views`` counts the frames that saw each vertex
-    meshes/<video>/00042.ply    the surface articulated at every frame of the source, object space (root motion off)
+    rest.obj, rest.mtl, texture.png    the surface at rest for everything else
+    meshes/<video>/00042.ply    the surface articulated at every frame of the source, object space (root motion off),
+                                on some of the vertices
+    motion/<video>.bvh          the joints' motion, root motion in a joint of its own
     cameras/<video>.json        K and object_to_camera of every frame of the source, usable as a given ``.poses.json``
+    colmap/                     the same cameras in COLMAP's text format
     bones.json                  joints: names, tree, Gaussians at rest
     turntable.mp4               the rest pose turning
     overlay-<video>.mp4         each source frame beside the posed mesh
@@ -16,7 +22,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +33,6 @@ from pipeline import BadInput, Folder, Resources, Run, Scene, stage
 from stages import formats
 from stages.export_files import (
     ExportedVideo,
-    Texture,
     write_bones,
     write_cameras,
     write_meshes,
@@ -35,14 +40,19 @@ from stages.export_files import (
     write_rest,
     write_turntable,
 )
-from stages.geometry.raster import rasterise, vertex_normals
-from stages.meshing import atlas, gltf, pictures, quality
-from stages.meshing.rig import Animatable, PosedClip, Rig, build_rig, field_colour, pose_clip, surface_colour
+from stages.export_measure import bake, measure
+from stages.export_rig import RigFiles, shown_pose
+from stages.meshing import quality
+from stages.meshing.cleanup import CleanerMissing, repair_with_pymeshlab
+from stages.meshing.coarse import coarse_subset
+from stages.meshing.naming import kind_of_body, name_by_place
+from stages.meshing.rig import Animatable, build_rig, surface_colour
 from stages.model.banmo import Banmo
 from stages.video_io import read_pictures
 
-_QUALITY_SIDE_PX = 256
-_BAKED_FRAMES = 60  # of all videos together
+_TRUSTED_AXES = 0.5  # trust in the root poses from which names by place (left, front ...) are given
+
+FORMATS = ("obj", "usdz", "bvh", "colmap")
 
 
 @dataclass(frozen=True)
@@ -59,6 +69,18 @@ class ExportSettings:
     """Side of the texture, coloured from the frames; 0 leaves vertex colours only."""
     frame_meshes: bool = True
     """Write a mesh for every frame of every video."""
+    frame_mesh_faces: int = 4000
+    """Faces of those meshes at most; 375 frames take about 22 MB at 4000 and 55 MB at 10000."""
+    formats: tuple[str, ...] = FORMATS
+    """What else to write: obj, usdz, bvh, colmap."""
+    rest_frame: str = ""
+    """The pose shown at rest: empty for the model's own, "mean" for the mean of all frames, or "video:frame"."""
+    root_motion: str = "object"
+    """What moves with the object in the GLB's clips: object, camera (it goes round the object), or none."""
+    category: str = ""
+    """Name the joints as of a "quadruped" or a "human"; empty takes what the features say, "other" names none."""
+    cleaner: str = "builtin"
+    """What mends the surface before it is decimated: builtin or pymeshlab."""
     video_side_px: int = 384
     """Longer side of one picture in the turntable and the overlays."""
     turntable_frames: int = 72
@@ -68,18 +90,21 @@ class ExportSettings:
 _RANGES = {
     "resolution": (16, 1024),
     "faces": (20, 2_000_000),
+    "frame_mesh_faces": (20, 2_000_000),
     "influences": (1, 32),
     "texture_px": (0, 8192),
     "video_side_px": (16, 2048),
     "turntable_frames": (1, 2000),
 }
+_CHOICES = {"root_motion": ("object", "camera", "none"), "cleaner": ("builtin", "pymeshlab")}
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus=1))
+@stage(per=Scene, version=2, needs=Resources(cpus=1))
 def export(
     refine: Folder,
     frames: dict[str, Folder],
     masks: dict[str, Folder],
+    features: dict[str, Folder],
     poses: Folder,
     settings: ExportSettings,
     out: Path,
@@ -89,6 +114,13 @@ def export(
     for key, (least, most) in _RANGES.items():
         if not least <= getattr(settings, key) <= most:
             raise BadInput(f"[export] {key} = {getattr(settings, key)} is not between {least} and {most}")
+    chosen = {key: getattr(settings, key) for key in _CHOICES}
+    for key, value, known in (
+        *((key, value, _CHOICES[key]) for key, value in chosen.items()),
+        *(("formats", value, FORMATS) for value in settings.formats),
+    ):
+        if value not in known:
+            raise BadInput(f"[export] {key}: {value!r} is none of {', '.join(known)}")
     model = Banmo.restore(*formats.read_model(refine.path))
     inputs = []
     for name in model.video_names:
@@ -96,7 +128,16 @@ def export(
         clip, facts = formats.read_clip(frames[name].path), formats.read_mask_facts(masks[name].path)
         inputs.append(ExportedVideo(name, clip, masks[name].path, facts, track.confidence))
     summary = formats.read_json(poses / "poses.json") if (poses / "poses.json").is_file() else {}
-    export_model(model, inputs, summary, settings, out, run)
+    category = settings.category or _category(features, summary.get("trust"))
+    export_model(model, inputs, summary, replace(settings, category=category), out, run)
+
+
+def _category(features: dict[str, Folder], trust: Any) -> str:
+    """What the features say the object is, where they agree and the object's axes can be believed; else ""."""
+    said = {str(formats.read_json(folder / "features.json").get("category", "")) for folder in features.values()}
+    kinds = {kind_of_body(category) for category in said}
+    believed = isinstance(trust, int | float) and trust >= _TRUSTED_AXES
+    return min(said) if len(kinds) == 1 and None not in kinds and believed else ""
 
 
 def export_model(
@@ -108,30 +149,44 @@ def export_model(
     run: Run,
 ) -> None:
     """Write the whole folder for a model whose videos are `inputs`, in the model's order."""
-    times = [video.clip.source_time_s for video in inputs]
+    names, times = [video.name for video in inputs], [video.clip.source_time_s for video in inputs]
     kept = max(1, settings.influences)
-    rig = build_rig(model, times, settings.resolution, settings.faces, sorted({4, 8, kept}))
+    repair = repair_with_pymeshlab if settings.cleaner == "pymeshlab" else None
+    try:
+        rig, clips = build_rig(model, times, settings.resolution, settings.faces, sorted({4, 8, kept}), repair)
+    except CleanerMissing as error:
+        hint = "pip install banmo-pipeline[clean], or cleaner = builtin"
+        raise BadInput("[export] cleaner: pymeshlab is not installed", hint=hint) from error
+    rig = replace(rig, skeleton=name_by_place(rig.skeleton, settings.category))
     run.log.info("surface: %d faces, %d joints", len(rig.mesh.faces), len(rig.skeleton))
+    shown = shown_pose(rig, names, clips, settings.rest_frame, kept)
     colours = [surface_colour(model, rig, k) for k in range(len(inputs))]
     colour = np.mean(colours, axis=0)
-    clips = [pose_clip(model, rig, k, times[k]) for k in range(len(inputs))]
 
     views = np.zeros(len(rig.mesh.vertices))
-    figures = [_measure(video, rig, posed, views, run) for video, posed in zip(inputs, clips, strict=True)]
-    texture = _bake(model, rig, inputs, clips, settings.texture_px, run) if settings.texture_px > 0 else None
+    figures = [measure(video, rig, posed, views, run) for video, posed in zip(inputs, clips, strict=True)]
+    texture = bake(model, rig, inputs, clips, settings.texture_px, run) if settings.texture_px > 0 else None
+    coarse = coarse_subset(rig.mesh, settings.frame_mesh_faces)
     for k, (video, posed) in enumerate(zip(inputs, clips, strict=True)):
         write_cameras(out, video, posed)
         if settings.frame_meshes:
-            write_meshes(out, video, rig, posed, colours[k])
+            write_meshes(out, video, coarse, posed, colours[k])
         write_overlay(out, video, rig, posed, colours[k], settings.video_side_px, run)
-    write_turntable(out, rig, colour, texture, settings.video_side_px, settings.turntable_frames, run)
-    write_rest(out, rig, colour, views)
+    side, turn = settings.video_side_px, settings.turntable_frames
+    write_turntable(out, rig, shown.vertices, shown.joints, colour, texture, side, turn, run)
+    write_rest(out, rig, shown.vertices, colour, views)
     write_bones(out, model, rig)
     report = quality.report(rig.mesh, rig.normals, rig.facts, figures, views, pose_summary)
     report["texture_from_frames"] = None if texture is None else round(texture.from_frames, 4)
     formats.write_json(out / "quality.json", report)
+    compared = max(sum(int(np.isfinite(f.iou).sum()) for f in figures), 1)
+    files = RigFiles(rig, shown, inputs, clips, colour, views / compared, texture, kept)
     extras = {"length": rig.mesh.length, "trust": report["trust"], "verdict": report["verdict"]}
-    (out / "model.glb").write_bytes(_glb(rig, inputs, clips, colour, texture, kept, extras))
+    files.write_glb(out, settings.root_motion, extras)  # type: ignore[arg-type]
+    for name in settings.formats:
+        {"obj": files.write_obj, "usdz": files.write_usdz, "bvh": files.write_bvh, "colmap": files.write_colmap}[name](
+            out
+        )
 
     for name in ("trust", "iou_mean", "unseen_area", "skinning_error", "faces"):
         run.metric(name, report[name])
@@ -172,112 +227,3 @@ def _sheet(out: Path, picture: Path) -> None:
         strip = np.concatenate(row, axis=1)
         strips.append(cv2.resize(strip, (width, max(1, round(strip.shape[0] * width / strip.shape[1])))))
     formats.write_image(picture, np.concatenate(strips))
-
-
-# --------------------------------------------------------------------------------------------- parts
-
-
-def _glb(
-    rig: Rig,
-    inputs: list[ExportedVideo],
-    clips: list[PosedClip],
-    colour: np.ndarray,
-    texture: Texture | None,
-    influences: int,
-    extras: dict[str, Any],
-) -> bytes:
-    motions = [
-        gltf.ClipMotion(
-            video.name,
-            video.clip.source_time_s,
-            posed.joints,
-            posed.camera_from_object,
-            posed.intrinsics,
-            video.clip.width,
-            video.clip.height,
-        )
-        for video, posed in zip(inputs, clips, strict=True)
-    ]
-    joint_idx, weight = rig.joint_skin(influences)
-    if texture is None:
-        mesh = gltf.RiggedMesh("model", rig.mesh.vertices, rig.normals, rig.mesh.faces, colour, joint_idx, weight)
-    else:
-        cut = texture.atlas.vertex  # a vertex on a seam has several texture coordinates, so it is written several times
-        mesh = gltf.RiggedMesh(
-            "model",
-            rig.mesh.vertices[cut],
-            rig.normals[cut],
-            texture.atlas.faces,
-            colour[cut],
-            joint_idx[cut],
-            weight[cut],
-            texture.atlas.uv,
-            _png(texture.picture),
-        )
-    return gltf.write_glb(mesh, rig.skeleton, motions, extras)
-
-
-def _png(picture: np.ndarray) -> bytes:
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]), [cv2.IMWRITE_PNG_COMPRESSION, 6])
-    if not ok:
-        raise formats.FormatError(f"cannot encode a texture of shape {picture.shape}")
-    return bytes(data)
-
-
-def _bake(
-    model: Animatable, rig: Rig, inputs: list[ExportedVideo], clips: list[PosedClip], size_px: int, run: Run
-) -> Texture:
-    """Colour the texture from frames spread over all videos."""
-    charts = atlas.unwrap(rig.mesh, size_px)
-    texels = atlas.texels_of(charts, size_px)
-    points = texels.spread(rig.mesh.faces, rig.mesh.vertices)
-    baker = atlas.Baker(rig.mesh, texels, field_colour(model, points, len(inputs)))
-    per_video = max(1, _BAKED_FRAMES // len(inputs))
-    for video, posed in zip(inputs, clips, strict=True):
-        chosen = np.unique(np.linspace(0, len(video.clip) - 1, per_video).round().astype(int))
-        for i in run.progress([c for c in chosen.tolist() if "missing" not in video.facts.flags[c]], label="texture"):
-            pose = posed.camera_from_object[video.clip.source_idx[i]]
-            points = posed.vertices[video.clip.source_idx[i]] @ pose[:3, :3].T + pose[:3, 3]
-            width, height = video.clip.width, video.clip.height
-            fragments = rasterise(points, rig.mesh.faces, posed.intrinsics, height, width)
-            mask = video.mask(i, width, height)
-            baker.add(points, posed.intrinsics, fragments, video.clip.image(i), mask, 0.01 * rig.mesh.length)
-        baker.end_clip()
-    picture, from_frames = baker.picture()
-    return Texture(charts, picture, from_frames)
-
-
-def _measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray, run: Run) -> quality.ClipQuality:
-    """Compare the posed mesh with every kept frame's mask; counts in `views` which vertices were seen."""
-    clip = video.clip
-    side = min(_QUALITY_SIDE_PX, max(clip.width, clip.height))
-    width, height, _ = pictures.scaled_size(clip.width, clip.height, side)
-    intrinsics = pictures.scaled_intrinsics(posed.intrinsics, clip.width, clip.height, width, height)
-    slack = 0.02 * rig.mesh.length
-    iou, missing, extra = np.full((3, len(clip)), np.nan)
-    for i, source in enumerate(run.progress(clip.source_idx, label=f"quality {video.name}")):
-        if "missing" in video.facts.flags[i]:
-            continue
-        pose = posed.camera_from_object[source]
-        points = posed.vertices[source] @ pose[:3, :3].T + pose[:3, 3]
-        fragments = rasterise(points, rig.mesh.faces, intrinsics, height, width)
-        mask = video.mask(i, width, height)
-        if not mask.any():
-            continue
-        iou[i] = quality.mask_iou(fragments.covered, mask)
-        missing[i], extra[i] = quality.mask_misfit(fragments.covered, mask)
-        normals = vertex_normals(points, rig.mesh.faces)
-        views += quality.visible_vertices(points, normals, intrinsics, fragments, mask, slack)
-    return quality.ClipQuality(
-        video.name,
-        clip.source_idx,
-        iou,
-        missing,
-        extra,
-        video.root_confidence,
-        video.facts.confidence,
-        video.facts.flags,
-        len(clip.source_time_s),
-        posed.skinning_error[8],
-        posed.skinning_error[4],
-    )

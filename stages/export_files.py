@@ -1,4 +1,4 @@
-"""The files of the ``export`` folder other than the GLB and the report: meshes, cameras, bones, videos."""
+"""Meshes, cameras, bones and videos of the ``export`` folder; the rig's own formats are in ``export_rig``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pipeline import Run
 from stages import formats
 from stages.meshing import pictures, ply
 from stages.meshing.atlas import Atlas
+from stages.meshing.coarse import Coarse
 from stages.meshing.rig import Animatable, PosedClip, Rig
 from stages.video_io import write_video
 
@@ -44,10 +45,15 @@ class Texture:
     from_frames: float
 
 
-def write_rest(out: Path, rig: Rig, colour: np.ndarray, views: np.ndarray) -> None:
-    """``rest.ply``: colour (V, 3) in 0..1, views (V,) frames that saw each vertex."""
-    writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), {"views": views.astype(np.float32)})
-    (out / "rest.ply").write_bytes(writer.encode(rig.mesh.vertices))
+def write_rest(out: Path, rig: Rig, shown: np.ndarray, colour: np.ndarray, views: np.ndarray) -> None:
+    """``rest.ply``: the pose shown (V, 3), colour (V, 3) in 0..1, views (V,) frames that saw each vertex.
+
+    Property ``filled`` is 1 where the vertex closes a hole of the surface.
+    """
+    filled = np.arange(len(views)) >= len(views) - rig.facts.holes_closed
+    extra = {"views": views.astype(np.float32), "filled": filled.astype(np.float32)}
+    writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), extra)
+    (out / "rest.ply").write_bytes(writer.encode(shown))
 
 
 def write_cameras(out: Path, video: ExportedVideo, posed: PosedClip) -> None:
@@ -66,13 +72,13 @@ def write_cameras(out: Path, video: ExportedVideo, posed: PosedClip) -> None:
     )
 
 
-def write_meshes(out: Path, video: ExportedVideo, rig: Rig, posed: PosedClip, colour: np.ndarray) -> None:
-    """``meshes/<video>/00000.ply``: the surface at every source frame, object space."""
+def write_meshes(out: Path, video: ExportedVideo, coarse: Coarse, posed: PosedClip, colour: np.ndarray) -> None:
+    """``meshes/<video>/00000.ply``: the surface at every source frame, object space, on some of its vertices."""
     folder = out / "meshes" / video.name
     folder.mkdir(parents=True)
-    writer = ply.PlyWriter(rig.mesh.faces, ply.to_bytes(colour), {})
+    writer = ply.PlyWriter(coarse.faces, ply.to_bytes(colour[coarse.vertex]), {})
     for i, vertices in enumerate(posed.vertices):
-        (folder / f"{i:05d}.ply").write_bytes(writer.encode(vertices))
+        (folder / f"{i:05d}.ply").write_bytes(writer.encode(vertices[coarse.vertex]))
 
 
 def _look(rig: Rig, colour: np.ndarray, texture: Texture | None = None) -> pictures.Look:
@@ -82,12 +88,20 @@ def _look(rig: Rig, colour: np.ndarray, texture: Texture | None = None) -> pictu
 
 
 def write_turntable(
-    out: Path, rig: Rig, colour: np.ndarray, texture: Texture | None, side_px: int, frames: int, run: Run
+    out: Path,
+    rig: Rig,
+    shown: np.ndarray,
+    joints: np.ndarray,
+    colour: np.ndarray,
+    texture: Texture | None,
+    side_px: int,
+    frames: int,
+    run: Run,
 ) -> None:
-    """``turntable.mp4``: the rest pose, textured and by skin weights."""
+    """``turntable.mp4``: the pose shown, vertices (V, 3) and joints (B, 4, 4), textured and by skin weights."""
     look = _look(rig, colour, texture)
-    sticks = rig.skeleton.sticks(rig.skeleton.rest)
-    images = pictures.turntable(look, rig.mesh.vertices, sticks, frames, max(2, side_px // 2 * 2))
+    sticks = rig.skeleton.sticks(joints)
+    images = pictures.turntable(look, shown, sticks, frames, max(2, side_px // 2 * 2))
     shown = run.progress(images, frames, "turntable")
     write_video(out / "turntable.mp4", shown, np.arange(frames) / _TURNTABLE_FPS)
 

@@ -92,8 +92,12 @@ class Baker:
         frame: np.ndarray,
         mask: np.ndarray,
         slack: float,
+        trust: float = 1.0,
     ) -> None:
-        """Take what one frame (H, W, 3) uint8 shows of the mesh at `vertices_camera` (V, 3), inside its mask."""
+        """Take what one frame (H, W, 3) uint8 shows of the mesh at `vertices_camera` (V, 3), inside its mask.
+
+        `trust` weighs the frame against others of its clip: a blurred frame should count for less.
+        """
         faces = self._mesh.faces
         normal = face_normals(vertices_camera, faces)
         centre = vertices_camera[faces].mean(axis=1)
@@ -116,7 +120,7 @@ class Baker:
         if not len(candidate):
             return
         colour = _bilinear(frame, position - 0.5)
-        weight = face_weight[self._texels.face[candidate]].astype(np.float32)
+        weight = (trust * face_weight[self._texels.face[candidate]]).astype(np.float32)
         weight[np.abs(colour - self._field[candidate]).max(axis=1) > _OUTLIER] = 0
         self._clip_total[candidate] += colour * weight[:, None]
         self._clip_weight[candidate] += weight

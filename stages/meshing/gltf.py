@@ -7,6 +7,9 @@ Layout of the scene::
       bone_..          joints, a tree; at rest in the file, moved by every clip
     camera_<video>     fixed where that video's camera is: at the origin, looking along -z
 
+or, with the root motion given to the camera, ``root_motion`` stays and ``camera_<video>`` is moved by its own clip;
+or nothing but the joints moves.
+
 glTF cameras look along -z with y up; ours (OpenCV) look along +z with y down. The two frames differ by half a turn
 about x, so the root motion is ``diag(1, -1, -1) @ camera_from_object``. At rest the root motion is the identity and the
 model stands upright at the origin, y up and front towards +z, as glTF wants it.
@@ -17,12 +20,14 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stages.meshing.skeleton import Skeleton, invert
+
+RootMotion = Literal["object", "camera", "none"]
 
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """glTF's camera frame from OpenCV's: half a turn about x."""
@@ -59,6 +64,7 @@ class RiggedMesh:
     joint_idx, weight: (V, K) skin, descending; padded to a multiple of four here.
     uv: (V, 2) and texture_png: the colour as a picture. With it the vertex colours become the attribute ``_COLOR``,
     since a viewer would multiply COLOR_0 with the texture.
+    seen: (V,) share of the frames that saw each vertex, 0 for never: the attribute ``_SEEN``.
     """
 
     name: str
@@ -70,6 +76,7 @@ class RiggedMesh:
     weight: np.ndarray
     uv: np.ndarray | None = None
     texture_png: bytes | None = None
+    seen: np.ndarray | None = None
 
 
 @dataclass
@@ -134,20 +141,30 @@ def clip_times(time_s: np.ndarray) -> np.ndarray:
     return times
 
 
-def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], extras: dict[str, Any]) -> bytes:
+def write_glb(
+    mesh: RiggedMesh,
+    skeleton: Skeleton,
+    clips: list[ClipMotion],
+    extras: dict[str, Any],
+    shown: np.ndarray | None = None,
+    root_motion: RootMotion = "object",
+) -> bytes:
     """The whole file; the same input gives the same bytes.
 
     Args:
         mesh: surface at rest with its skin.
-        skeleton: joints at rest.
+        skeleton: joints at rest, to which the skin is bound.
         clips: one animation each, in this order.
         extras: plain JSON kept under ``asset.extras``.
+        shown: (B, 4, 4) object_from_joint of the pose in which the file shows the model while no clip plays; None for
+            the pose it is bound in. The skin stays bound where it is, so that the clips lose nothing.
+        root_motion: what a clip moves for it: the object before a fixed camera, the camera round it, or nothing.
     """
     builder = _Builder()
     count = len(skeleton)
     joint_nodes = [2 + j for j in range(count)]
     nodes: list[dict[str, Any]] = [{"name": mesh.name, "mesh": 0, "skin": 0}, {"name": "root_motion"}]
-    local = skeleton.local(skeleton.rest)
+    local = skeleton.local(skeleton.rest if shown is None else shown)
     for j in range(count):
         translation, rotation = translation_rotation(local[j : j + 1])
         node: dict[str, Any] = {
@@ -163,7 +180,11 @@ def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], ext
     top_nodes = [0, 1]
     for k, clip in enumerate(clips):
         top_nodes.append(len(nodes))
-        nodes.append({"name": f"camera_{clip.name}", "camera": k})
+        node = {"name": f"camera_{clip.name}", "camera": k}
+        if root_motion == "camera":  # it is moved by its clip; until one plays it is where the clip starts
+            start_t, start_r = translation_rotation(_camera_in_object(clip)[:1])
+            node |= {"translation": start_t[0].tolist(), "rotation": start_r[0].tolist()}
+        nodes.append(node)
 
     inverse_bind = np.swapaxes(invert(skeleton.rest), 1, 2).astype(np.float32).reshape(count, 16)
     matte: dict[str, Any] = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
@@ -190,7 +211,10 @@ def write_glb(mesh: RiggedMesh, skeleton: Skeleton, clips: list[ClipMotion], ext
         document["images"] = [{"name": "colour", "mimeType": "image/png", "bufferView": builder.view(mesh.texture_png)}]
     if clips:
         document["cameras"] = [_camera(clip) for clip in clips]
-        document["animations"] = [_animation(builder, clip, skeleton, joint_nodes) for clip in clips]
+        document["animations"] = [
+            _animation(builder, clip, skeleton, joint_nodes, top_nodes[2 + k], root_motion)
+            for k, clip in enumerate(clips)
+        ]
     document["accessors"], document["bufferViews"] = builder.accessors, builder.views
     document["buffers"] = [{"byteLength": len(builder.blob)}]
     return _pack(document, bytes(builder.blob))
@@ -212,6 +236,8 @@ def _primitive(builder: _Builder, mesh: RiggedMesh, joint_count: int) -> dict[st
     else:
         colour[:, :3] = linear_from_srgb(mesh.colour)
         attributes["COLOR_0"] = builder.add(np.round(colour * 65535).astype(np.uint16), _VERTEX_DATA, normalised=True)
+    if mesh.seen is not None:
+        attributes["_SEEN"] = builder.add(mesh.seen.astype(np.float32), _VERTEX_DATA)
     for part in range(-(-kept // 4)):
         joints = np.zeros((vertex_count, 4), joint_type)
         weights = np.zeros((vertex_count, 4), np.float32)
@@ -239,7 +265,19 @@ def _camera(clip: ClipMotion) -> dict[str, Any]:
     }
 
 
-def _animation(builder: _Builder, clip: ClipMotion, skeleton: Skeleton, joint_nodes: list[int]) -> dict[str, Any]:
+def _camera_in_object(clip: ClipMotion) -> np.ndarray:
+    """Scene_from_camera (T, 4, 4), glTF's camera frame, with the object at rest in the scene."""
+    return np.asarray(invert(clip.camera_from_object) @ GL_FROM_CV)
+
+
+def _animation(
+    builder: _Builder,
+    clip: ClipMotion,
+    skeleton: Skeleton,
+    joint_nodes: list[int],
+    camera_node: int,
+    root_motion: RootMotion,
+) -> dict[str, Any]:
     times = builder.add(clip_times(clip.time_s), bounds=True)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
@@ -249,7 +287,10 @@ def _animation(builder: _Builder, clip: ClipMotion, skeleton: Skeleton, joint_no
             samplers.append({"input": times, "output": builder.add(values), "interpolation": "LINEAR"})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
 
-    move(1, GL_FROM_CV @ clip.camera_from_object)
+    if root_motion == "object":
+        move(1, GL_FROM_CV @ clip.camera_from_object)
+    elif root_motion == "camera":
+        move(camera_node, _camera_in_object(clip))
     local = skeleton.local(clip.joints)
     for j, node in enumerate(joint_nodes):
         move(node, local[:, j])

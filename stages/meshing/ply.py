@@ -34,10 +34,12 @@ class PlyWriter:
             row[name] = self.colour[:, channel]
         for name, values in self.extra.items():
             row[name] = values
-        face = np.empty(len(self.faces), np.dtype([("count", "u1"), ("index", "<i4", 3)]))
+        index, name_of_index = ("<u2", "ushort") if len(vertices) <= 65_535 else ("<i4", "int")
+        face = np.empty(len(self.faces), np.dtype([("count", "u1"), ("index", index, 3)]))
         face["count"], face["index"] = 3, self.faces
         kinds = {"<f4": "float", "u1": "uchar"}
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
         header += [f"property {kinds[kind]} {name}" for name, kind in fields]
-        header += [f"element face {len(self.faces)}", "property list uchar int vertex_indices", "end_header\n"]
+        header += [f"element face {len(self.faces)}", f"property list uchar {name_of_index} vertex_indices"]
+        header += ["end_header\n"]
         return "\n".join(header).encode("ascii") + row.tobytes() + face.tobytes()

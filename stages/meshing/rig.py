@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,11 +12,12 @@ from torch import Tensor
 
 from stages.geometry.raster import vertex_normals
 from stages.meshing.skeleton import Skeleton, build_skeleton, nearest_rigid
-from stages.meshing.skinning import blend, fit_influences
+from stages.meshing.skinning import blend, fit_influences, refit_worst
 from stages.meshing.surface import EmptySurface, Mesh, SurfaceFacts, clean_surface, evaluate, extract
 
 _POINTS_PER_WARP = 150_000
 _FIT_FRAMES = 150  # of all clips together, to fit the skin to
+_SKIN_TOLERANCE = 7e-4  # of the length: vertices that are farther off in some frame are fitted again
 
 
 class Animatable(Protocol):
@@ -113,16 +114,18 @@ class PosedClip:
     skinning_error: dict[int, float]
 
 
-def surface_of(model: Animatable, resolution: int, face_budget: int) -> tuple[Mesh, SurfaceFacts]:
+def surface_of(
+    model: Animatable, resolution: int, face_budget: int, repair: Callable[[Mesh], Mesh] | None = None
+) -> tuple[Mesh, SurfaceFacts]:
     """The model's surface at level 0, cleaned; of a model without one, a level that encloses 2 % of its box."""
     bounds = model.bounds.cpu().numpy().astype(np.float64)
     try:
-        return clean_surface(extract(model.sdf, bounds, resolution), face_budget)
+        return clean_surface(extract(model.sdf, bounds, resolution), face_budget, repair=repair)
     except EmptySurface:
         axes = [np.linspace(bounds[0, k], bounds[1, k], 32) for k in range(3)]
         values = evaluate(model.sdf, np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
         level = float(np.quantile(values, 0.02)) + 1e-4
-        return clean_surface(extract(model.sdf, bounds, min(resolution, 64), level), face_budget, level)
+        return clean_surface(extract(model.sdf, bounds, min(resolution, 64), level), face_budget, level, repair)
 
 
 def build_rig(
@@ -131,36 +134,45 @@ def build_rig(
     resolution: int,
     face_budget: int,
     influences: Sequence[int] = (8, 4),
-) -> Rig:
-    """Extract the surface and join the bones.
+    repair: Callable[[Mesh], Mesh] | None = None,
+) -> tuple[Rig, list[PosedClip]]:
+    """Extract the surface, join the bones, and pose both as in every video.
 
     Args:
         clip_times_s: times in seconds of each video, in the model's order.
         resolution: cells along the longest edge of the object's box.
         face_budget: faces to keep.
-        influences: the numbers of influences to make skins for.
+        influences: the numbers of influences to make skins for; the largest is made as exact as it can be.
+        repair: a tool of the user's that mends the mesh before it is decimated.
     """
-    mesh, facts = surface_of(model, resolution, face_budget)
+    mesh, facts = surface_of(model, resolution, face_budget, repair)
     weights = model.rest_weights(_points(mesh.vertices)).cpu().numpy().astype(np.float64)
     weights = np.clip(weights, 0, None)
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-    samples = [times[:: max(1, -(-len(times) * len(clip_times_s) // _FIT_FRAMES))] for times in clip_times_s]
-    motion = np.concatenate([_bone_motion(model, k, times) for k, times in enumerate(samples)])
-    posed = np.concatenate([_warp(model, mesh.vertices, k, times) for k, times in enumerate(samples)])
+    posed = [_warp(model, mesh.vertices, k, times) for k, times in enumerate(clip_times_s)]
+    motion = [nearest_rigid(_bone_motion(model, k, times)) for k, times in enumerate(clip_times_s)]
+    every = [slice(None, None, max(1, -(-len(times) * len(posed) // _FIT_FRAMES))) for times in clip_times_s]
+    some_motion = np.concatenate([m[part] for m, part in zip(motion, every, strict=True)])
+    some_posed = np.concatenate([p[part] for p, part in zip(posed, every, strict=True)])
 
     def inside(points: np.ndarray) -> np.ndarray:
         return evaluate(model.sdf, points) < facts.level
 
     parents = None if model.bone_parents is None else model.bone_parents.cpu().numpy()
-    skeleton = build_skeleton(model.bone_centres.cpu().numpy(), motion, weights, mesh.vertices, inside, parents)
-    skins = {k: fit_influences(mesh.vertices, weights, motion, posed, k, mesh.length) for k in influences}
-    return Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts, skins)
+    skeleton = build_skeleton(model.bone_centres.cpu().numpy(), some_motion, weights, mesh.vertices, inside, parents)
+    length = max(mesh.length, 1e-12)
+    skins = {k: fit_influences(mesh.vertices, weights, some_motion, some_posed, k, length) for k in influences}
+    most = max(influences)
+    whole = np.concatenate(motion), np.concatenate(posed)
+    skins[most] = refit_worst(mesh.vertices, weights, *whole, skins[most], length, _SKIN_TOLERANCE)
+    rig = Rig(mesh, vertex_normals(mesh.vertices, mesh.faces), weights, skeleton, facts, skins)
+    clips = [_posed_clip(model, rig, k, clip_times_s[k], posed[k], motion[k]) for k in range(len(posed))]
+    return rig, clips
 
 
-def pose_clip(model: Animatable, rig: Rig, video_idx: int, time_s: np.ndarray) -> PosedClip:
-    """The rig at times (T,) in seconds of one video."""
-    vertices = _warp(model, rig.mesh.vertices, video_idx, time_s)
-    transforms = nearest_rigid(_bone_motion(model, video_idx, time_s))
+def _posed_clip(
+    model: Animatable, rig: Rig, video_idx: int, time_s: np.ndarray, vertices: np.ndarray, transforms: np.ndarray
+) -> PosedClip:
     error = {}
     for influences, (index, weight) in rig.skins.items():
         worst = [

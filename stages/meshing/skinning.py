@@ -31,6 +31,7 @@ def fit_influences(
     posed: np.ndarray,
     influences: int,
     length: float,
+    frame_weight: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The largest weights of each vertex, adjusted so that fewer influences still follow the full motion.
 
@@ -46,6 +47,7 @@ def fit_influences(
         posed: (T, V, 3) where the model puts the vertices.
         influences: how many to keep.
         length: of the object.
+        frame_weight: (T, V) how much each frame counts for each vertex, mean 1; None for all alike.
 
     Returns:
         As :func:`top_influences`.
@@ -61,11 +63,61 @@ def fit_influences(
         points = vertices[part].astype(np.float32)
         moved = (rotation @ points.T + offset[..., None]).transpose(3, 1, 0, 2)  # (v, B, T, 3)
         chosen = np.take_along_axis(moved, index[part][:, :, None, None], axis=1)
-        gap = (chosen - posed[:, part].transpose(1, 0, 2)[:, None]).reshape(len(points), wide, -1)
+        gap = chosen - posed[:, part].transpose(1, 0, 2)[:, None]
+        if frame_weight is not None:
+            gap *= np.sqrt(frame_weight[:, part]).T[:, None, :, None]
+        gap = gap.reshape(len(points), wide, -1)
         gram = (gap @ gap.swapaxes(1, 2)).astype(np.float64) / (len(transforms) * length**2)
         value[part] = _sparse_least_squares(gram, value[part], kept)
     order = np.argsort(-value, axis=1, kind="stable")[:, :kept]
     return _tidy(np.take_along_axis(index, order, axis=1), np.take_along_axis(value, order, axis=1))
+
+
+def refit_worst(
+    vertices: np.ndarray,
+    weights: np.ndarray,
+    transforms: np.ndarray,
+    posed: np.ndarray,
+    skin: tuple[np.ndarray, np.ndarray],
+    length: float,
+    tolerance: float,
+    rounds: int = 6,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A skin whose largest error is smaller: vertices that miss `tolerance` somewhere are fitted to their worst frames.
+
+    Least squares spread the error evenly over time; what people see is the one frame that breaks. So frames are
+    reweighted by their error, again and again, and what lowers a vertex's largest error is kept.
+
+    Args:
+        vertices, weights, transforms, posed, length: as for :func:`fit_influences`.
+        skin: bone indices and weights (V, K), as :func:`fit_influences` gives them.
+        tolerance: in units of the length.
+    """
+    index, weight = (part.copy() for part in skin)
+    error = _errors(vertices, transforms, posed, index, weight) / length
+    bad = np.flatnonzero(error.max(axis=0) > tolerance)
+    if not len(bad):
+        return index, weight
+    part, target, error = vertices[bad], posed[:, bad], error[:, bad]
+    best, emphasis = error.max(axis=0), np.ones_like(error)
+    for _ in range(rounds):
+        emphasis *= 0.05 + error / np.maximum(error.max(axis=0), 1e-12)
+        emphasis /= emphasis.mean(axis=0)
+        tried = fit_influences(part, weights[bad], transforms, target, index.shape[1], length, emphasis)
+        error = _errors(part, transforms, target, *tried) / length
+        better = error.max(axis=0) < best
+        best = np.minimum(best, error.max(axis=0))
+        index[bad[better]], weight[bad[better]] = tried[0][better], tried[1][better]
+    return index, weight
+
+
+def _errors(
+    vertices: np.ndarray, transforms: np.ndarray, posed: np.ndarray, index: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
+    """(T, V) distances between linear blend skinning and where the vertices should be."""
+    moved = blend(vertices, transforms, index, weight)
+    moved -= posed
+    return np.asarray(np.sqrt(np.einsum("tvc,tvc->tv", moved, moved)))
 
 
 def _sparse_least_squares(gram: np.ndarray, start: np.ndarray, kept: int) -> np.ndarray:

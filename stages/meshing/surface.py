@@ -263,9 +263,16 @@ class SurfaceFacts:
     level: float
 
 
-def clean_surface(raw: Mesh, face_budget: int, level: float = 0.0) -> tuple[Mesh, SurfaceFacts]:
-    """Largest component, decimated to the budget, without holes."""
+def clean_surface(
+    raw: Mesh, face_budget: int, level: float = 0.0, repair: Callable[[Mesh], Mesh] | None = None
+) -> tuple[Mesh, SurfaceFacts]:
+    """Largest component, repaired by a tool of the user's if there is one, decimated to the budget, without holes.
+
+    Closing a hole only adds vertices behind the others: the last ``facts.holes_closed`` of them are the fillings.
+    """
     mesh, dropped = largest_component(raw)
+    if repair is not None:
+        mesh, _ = largest_component(weld(repair(mesh)))
     mesh, _ = largest_component(decimate(mesh, face_budget))
     mesh, holes = close_holes(mesh)
     facts = SurfaceFacts(len(raw.faces), len(mesh.faces), len(mesh.vertices), dropped, holes, level)

@@ -95,14 +95,15 @@ def write_inputs(
     from stages.meshing.surface import extract
 
     mesh = extract(model.sdf, model.bounds.numpy(), 32)
-    folders: dict[str, dict[str, Path]] = {"frames": {}, "masks": {}}
+    folders: dict[str, dict[str, Path]] = {"frames": {}, "masks": {}, "features": {}}
     poses_root, refine_root = root / "poses", root / "refine"
     (refine_root / "poses").mkdir(parents=True)
     poses_root.mkdir()
     for k, name in enumerate(model.video_names):
-        frames_root, masks_root = root / "frames" / str(k), root / "masks" / str(k)
-        frames_root.mkdir(parents=True)
-        masks_root.mkdir(parents=True)
+        frames_root, masks_root, features_root = (root / kind / str(k) for kind in ("frames", "masks", "features"))
+        for folder in (frames_root, masks_root, features_root):
+            folder.mkdir(parents=True)
+        formats.write_json(features_root / "features.json", {"category": "other"})
         time_s = np.arange(times) * 0.1 + 0.05 * k
         kept = np.array([i for i in range(times) if i not in dropped])
         clip = formats.Clip(frames_root, model.size_px, model.size_px, kept, time_s)
@@ -126,6 +127,7 @@ def write_inputs(
         track = formats.PoseTrack(model.intrinsics(k).double().numpy(), poses, np.ones(count), ["given"] * count)
         formats.write_poses(refine_root / "poses" / f"{name}.json", track, clip)
         folders["frames"][name], folders["masks"][name] = frames_root, masks_root
+        folders["features"][name] = features_root
     formats.write_json(poses_root / "poses.json", {"trust": 0.9, "advice": ""})
     return folders
 

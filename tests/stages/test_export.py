@@ -33,12 +33,14 @@ class Result:
         folders = write_inputs(model, root / "in", FRAMES)
         self.frames = {n: Folder(p) for n, p in folders["frames"].items()}
         self.masks = {n: Folder(p) for n, p in folders["masks"].items()}
+        self.features = {n: Folder(p) for n, p in folders["features"].items()}
 
     def run(self, out: Path) -> tuple[Path, Run]:
         out.mkdir()
         run = Run()
         folder = self.root / "in"
-        export(Folder(folder / "refine"), self.frames, self.masks, Folder(folder / "poses"), self.settings, out, run)
+        inputs = Folder(folder / "refine"), self.frames, self.masks, self.features, Folder(folder / "poses")
+        export(*inputs, self.settings, out, run)
         stage_module._check(out, self.frames, self.settings)
         return out, run
 
@@ -363,7 +365,7 @@ def test_doubtful_masks_poses_and_missing_objects_are_told(stand_in: dict[str, C
 def test_senseless_settings_are_refused_in_one_sentence(key: str, tmp_path: Path) -> None:
     settings = dataclasses.replace(SETTINGS, **{key: -1})
     with pytest.raises(BadInput, match=rf"\[export\] {key} = -1 is not between"):
-        export(Folder(tmp_path), {}, {}, Folder(tmp_path), settings, tmp_path, Run())
+        export(Folder(tmp_path), {}, {}, {}, Folder(tmp_path), settings, tmp_path, Run())
 
 
 def test_the_check_refuses_a_folder_that_lacks_a_frame(stand_in: dict[str, Chain], tmp_path: Path) -> None:
@@ -383,7 +385,8 @@ def test_the_contact_sheet_is_a_picture(result: tuple[Result, Path, Run], tmp_pa
 
 def test_without_texture_and_frame_meshes(stand_in: dict[str, Chain], tmp_path: Path) -> None:
     stand_in["model"] = Chain(["v"], bones=2)
-    made = Result(stand_in["model"], tmp_path, ExportSettings(32, 300, 4, 0, False, 64, 2))
+    settings = ExportSettings(32, 300, 4, 0, False, video_side_px=64, turntable_frames=2)
+    made = Result(stand_in["model"], tmp_path, settings)
     out, _ = made.run(tmp_path / "out")
     assert not (out / "meshes").exists()
     glb = Glb((out / "model.glb").read_bytes())
