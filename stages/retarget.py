@@ -67,7 +67,7 @@ class TrackSettings(ClipSettings):
     """Fastest motion that the pose codes can follow."""
     same_subject: bool = False
     """The clip shows the very subject of the model: its colours count."""
-    known_frames: int = 240
+    known_frames: int = 160
     """Frames of the known clips whose articulation may start a frame."""
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
@@ -229,7 +229,7 @@ def _searched(known: Folder, clip: formats.Clip, masks: Folder, settings: OntoSe
     from stages.retargeting.placing import register
 
     model = Banmo.restore(*formats.read_model(known.path))
-    surface = model.surface[spread(len(model.surface), 260)]
+    surface = model.surface[spread(len(model.surface), 120)]
     shapes = known_shapes(model, spread(len(model.time), settings.shapes), surface)
     facts = formats.read_mask_facts(masks.path)
     builder = ObservationBuilder(steps=())

@@ -44,7 +44,7 @@ def mask_distance(silhouette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     inside = silhouette > 127
     rows, columns = np.nonzero(inside)
-    step = max(1, len(rows) // 160)
+    step = max(1, len(rows) // 96)
     some = np.stack([columns[::step], rows[::step]], axis=1).astype(np.float32) + 0.5
     return distance_transform_edt(~inside).astype(np.float32), some
 
@@ -90,7 +90,7 @@ def best_sequence(cost: Tensor, jump: Tensor) -> Tensor:
 
 @torch.no_grad()
 def first_articulation(
-    model: Banmo, poses: Tensor, intrinsics: Tensor, observations: Observations, smooth: float = 0.5, most: int = 240
+    model: Banmo, poses: Tensor, intrinsics: Tensor, observations: Observations, smooth: float = 0.5, most: int = 160
 ) -> tuple[Tensor, Tensor]:
     """Known frames (T,) whose articulation starts each frame of the new clip, and what each still misfits (T,).
 
@@ -101,7 +101,7 @@ def first_articulation(
         most: known frames that are tried.
     """
     frames = spread(len(model.time), most)
-    surface = model.surface[spread(len(model.surface), 280)]
+    surface = model.surface[spread(len(model.surface), 160)]
     shapes = known_shapes(model, frames, surface)
     cost = misfit(shapes, poses, intrinsics, observations)
     # Successive known frames of one video differ by a frame's motion: moving along a known clip is never dear.
