@@ -1,0 +1,62 @@
+"""The networks this product brings along, trained on generated bodies only (docs/networks.md)."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+WEIGHTS = Path(__file__).parent / "weights"
+CATEGORIES = ("quadruped", "human")
+DIGESTS = {
+    "posenet-quadruped.onnx": "e31567b6d440a3604a918e3a6766ba398731433eb7b7943a383f7b79ec900119",
+    "posenet-human.onnx": "8e17b6d6024543d970eb467cd1e9ef9ed415cb2cd89631ff18c5c154d17d5f99",
+    "quadruped.npz": "08373e5a03d1254f1c6c6ebc2a0c906b477896d7a3686ba223c27289d8024793",
+    "human.npz": "9a473fd4c1fb632bef153ce3d2d1810731028a211436b49c4e7de11bcf1dbb78",
+}
+"""sha256 of the files this code was written with; they are code as far as a result's key is concerned."""
+
+
+class WeightsDamaged(RuntimeError):
+    """A file of ours is missing or not what it should be: the installation is at fault."""
+
+
+class OwnNetwork:
+    """A category's PoseNet: view, dense mask and embedding, category (see stages.perception.viewpoint.PoseNetwork)."""
+
+    def __init__(self, category: str, *, device: str = "cpu", threads: int = 1) -> None:
+        self.category = category
+        self.name = f"posenet-{category}.onnx"
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = max(1, threads)
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
+        providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
+        self._session = onnxruntime.InferenceSession(_read(self.name), options, providers=providers)
+        self.providers: list[str] = self._session.get_providers()
+        self._outputs = [o.name for o in self._session.get_outputs()]
+
+    def __call__(self, inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """`view` (N, 60), `dense` (N, 17, 48, 48), `category` (N, 3) of (N, 4, 96, 96) float32."""
+        return dict(zip(self._outputs, self._session.run(None, {"input": inputs.astype(np.float32)}), strict=True))
+
+
+def canonical_surface(category: str) -> dict[str, np.ndarray]:
+    """`vertices` (V, 3) and `faces` (F, 3) of the category's canonical surface, `embedding` (V, 16) of unit length."""
+    _read(f"{category}.npz")
+    with np.load(WEIGHTS / f"{category}.npz", allow_pickle=False) as file:
+        return {name: file[name] for name in ("vertices", "faces", "embedding")}
+
+
+def _read(name: str) -> bytes:
+    try:
+        data = (WEIGHTS / name).read_bytes()
+    except OSError as error:
+        raise WeightsDamaged(f"stages/weights/{name} cannot be read ({error.strerror}); install again") from error
+    if hashlib.sha256(data).hexdigest() != DIGESTS[name]:
+        raise WeightsDamaged(f"stages/weights/{name} is not the file that was shipped; install again")
+    return data
