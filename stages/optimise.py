@@ -55,6 +55,10 @@ class FitSettings(PhaseSettings):
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
+    motion_spacing_s: float = 0.0
+    """Spacing of local functions of time in the pose codes, beside the waves; 0 = waves alone, as in the paper."""
+    pose_code: int = 96
+    """Channels of the pose codes."""
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
@@ -174,7 +178,9 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
         voxel=settings.voxel,
         mlp_depth=settings.mlp_depth,
         mlp_width=settings.mlp_width,
+        pose_code=settings.pose_code,
         octaves=initialise.octaves(collection.videos, settings.motion_period_s),
+        splines=initialise.splines(collection.videos, settings.motion_spacing_s),
     )
     free = 1 - collection.root_fixed
     if settings.start == "sphere":

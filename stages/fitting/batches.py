@@ -32,6 +32,18 @@ class Batch(NamedTuple):
         """Some frames of the batch."""
         return Batch(*(None if x is None else x[part] for x in self))
 
+    def pixels_of(self, columns: Tensor) -> Batch:
+        """Some pixels (F, Q) of each frame."""
+        wide = columns[..., None]
+        return self._replace(
+            pixels=self.pixels.gather(1, wide.expand(-1, -1, 2)),
+            rgb=self.rgb.gather(1, wide.expand(-1, -1, 3)),
+            mask=self.mask.gather(1, columns),
+            flow=self.flow.gather(1, wide.expand(-1, -1, 2)),
+            flow_confidence=self.flow_confidence.gather(1, columns),
+            features=None if self.features is None else self.features.gather(1, wide.expand(-1, -1, 16)),
+        )
+
 
 class Draws:
     """The random numbers of a step for `part` of a batch of `frames` frames.
@@ -57,12 +69,20 @@ def step_generator(seed: int, step: int, rank: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(int(mixed[0]) << 31 ^ int(mixed[1]))
 
 
-def draw(observations: Observations, frames: int, pixels: int, generator: torch.Generator) -> Batch:
-    """Draw a batch: frames in proportion to their weight, pixels evenly near the object."""
+def draw(
+    observations: Observations, frames: int, pixels: int, generator: torch.Generator, edge_share: float = 0.0
+) -> Batch:
+    """Draw a batch: frames in proportion to their weight, pixels evenly near the object.
+
+    Of a frame's pixels the first `edge_share` are drawn near the mask's edge alone, where limbs and outlines are.
+    """
     chosen = torch.multinomial(observations.frame_weight, frames, replacement=True, generator=generator)
     start, count = observations.offsets[chosen], observations.offsets[chosen + 1] - observations.offsets[chosen]
     unit = torch.rand(frames, pixels, generator=generator)
-    rows = start[:, None] + (unit * count[:, None]).long().clamp_max((count - 1)[:, None])
+    count = count[:, None].repeat(1, pixels)
+    edge = observations.edge_count[chosen][:, None]
+    count[:, : round(edge_share * pixels)] = torch.where(edge > 0, edge, count[:, :1])
+    rows = start[:, None] + (unit * count).long().minimum(count - 1)
 
     flow = torch.zeros(frames, pixels, 2)
     confidence = torch.zeros(frames, pixels)

@@ -15,7 +15,7 @@ from stages.fitting.observations import Observations
 from stages.geometry.cameras import transform
 from stages.model.banmo import Architecture, Banmo, VideoFacts
 from stages.model.fields import GridField
-from stages.model.motion import octaves_for
+from stages.model.motion import octaves_for, splines_for
 from stages.model.skeleton import Bones, bone_tree
 
 
@@ -158,3 +158,8 @@ def build(
 def octaves(videos: list[VideoFacts], shortest_period_s: float) -> int:
     """Octaves of the pose codes for the longest of `videos`."""
     return octaves_for(max(v.time_s[-1] - v.time_s[0] for v in videos), shortest_period_s)
+
+
+def splines(videos: list[VideoFacts], spacing_s: float) -> int:
+    """Local functions of the pose codes for the longest of `videos`, about `spacing_s` apart; none if that is zero."""
+    return splines_for(max(v.time_s[-1] - v.time_s[0] for v in videos), spacing_s)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from stages.fitting.active import Uncertainty
 from stages.fitting.batches import Batch, Draws
 from stages.fitting.schedule import PhaseSettings
 from stages.fitting.team import ALONE, Team
@@ -110,6 +111,7 @@ def evaluate(
     step: int,
     generator: torch.Generator,
     team: Team = ALONE,
+    uncertainty: Uncertainty | None = None,
 ) -> dict[str, Tensor]:
     """Every active term of the objective, already weighted; their sum is minimised.
 
@@ -139,6 +141,9 @@ def evaluate(
         add("silhouette", settings.weight_silhouette, losses.silhouette_loss(seen.opacity, batch.mask, weight))
     if settings.weight_rgb:
         add("rgb", settings.weight_rgb, losses.colour_loss(seen.colour, batch.rgb, inside * opacity))
+    if uncertainty is not None:
+        error = losses.ray_error(seen.colour, batch.rgb, seen.opacity, batch.mask, inside * opacity).detach()
+        add("uncertainty", 1.0, (uncertainty.of(model, batch) - error).abs().mean())
     if settings.weight_flow and has_flow:
         moved = transform(partner.camera_from_object, model.forward_points(partner, seen.surface))
         flow = project(partner.intrinsics, moved) - batch.pixels
@@ -240,8 +245,8 @@ def _shape_terms(model: Banmo, prepared: Tensor, settings: PhaseSettings, step: 
     if settings.weight_bone_location and settings.lr_bones:
         depth = model.field.sdf(prepared.detach(), model.bones.centres)
         terms["bone_inside"] = settings.weight_bone_location * torch.relu(depth).mean()
-        if step % 10 == 0 and len(model.surface):
-            surface = model.surface[:: max(1, len(model.surface) // 400)]
+        if step % 20 == 0 and len(model.surface):
+            surface = model.surface[:: max(1, len(model.surface) // 160)]
             value = losses.sinkhorn_divergence(model.bones.centres, surface, blur=0.05)
             terms["bone_location"] = settings.weight_bone_location * value
     return terms

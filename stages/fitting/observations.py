@@ -1,8 +1,8 @@
 """What was seen, packed for sampling: pixels near the object of every kept frame, one row a pixel.
 
 Only pixels within a margin of the mask are kept: the rest of the picture says nothing that its silhouette rows do
-not. Rows of frame f are ``offsets[f] : offsets[f + 1]``. T frames, M rows. Flow of step s leads s kept frames ahead
-(behind if negative) in the same clip.
+not. Rows of frame f are ``offsets[f] : offsets[f + 1]``, those near the mask's edge first. T frames, M rows. Flow of
+step s leads s kept frames ahead (behind if negative) in the same clip.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ class Observations:
     video_idx: Tensor  # (T,) int64
     frame_weight: Tensor  # (T,) float32 in 0..1: how far the mask is trusted; 0 = unusable
     offsets: Tensor  # (T + 1,) int64
+    edge_count: Tensor  # (T,) int64: how many of a frame's first rows lie near the mask's edge
     xy: Tensor  # (M, 2) int16: column, row
     rgb: Tensor  # (M, 3) uint8
     mask: Tensor  # (M,) uint8, 255 = object
@@ -64,8 +65,11 @@ class ObservationBuilder:
         height, width = mask.shape
         inside = mask > 127
         margin = max(4.0, self.margin_share * max(height, width))
-        near = distance_transform_edt(~inside) <= margin if inside.any() else np.zeros_like(inside)
-        rows, columns = np.nonzero(near)
+        beyond = distance_transform_edt(~inside) if inside.any() else np.full(inside.shape, np.inf)
+        rows, columns = np.nonzero(beyond <= margin)
+        depth = np.where(inside, distance_transform_edt(inside), beyond)[rows, columns]
+        order = np.argsort(depth > margin / 2, kind="stable")
+        rows, columns, edge = rows[order], columns[order], int((depth <= margin / 2).sum())
         scale = min(1.0, self.small_px / max(height, width))
         size = (max(1, round(height * scale)), max(1, round(width * scale)))
         small = resize(mask.astype(np.float32), size, order=1, anti_aliasing=scale < 1, preserve_range=True)
@@ -99,6 +103,7 @@ class ObservationBuilder:
             scale=np.float32(size[1] / width),
             size=np.array([width, height], np.float32),
             count=np.int64(len(rows)),
+            edge=np.int64(edge),
         )
 
     def finish(self, features: np.ndarray | None = None, crops: np.ndarray | None = None) -> Observations:
@@ -117,6 +122,7 @@ class ObservationBuilder:
             video_idx=video,
             frame_weight=torch.tensor(np.array(self._frames["weight"])),
             offsets=torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)]),
+            edge_count=torch.tensor(np.array(self._frames["edge"])),
             xy=rows["xy"],
             rgb=rows["rgb"],
             mask=rows["mask"],

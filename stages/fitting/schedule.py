@@ -19,6 +19,12 @@ class PhaseSettings:
     """Frames in a batch."""
     pixels_per_frame: int = 112
     """Rays a frame in a batch."""
+    edge_share: float = 0.0
+    """Share of them drawn within a few pixels of the mask's edge."""
+    active_share: float = 0.0
+    """Share of them drawn where a small network expects large errors: the worst of four times as many candidates."""
+    active_from: float = 0.3
+    """Share of the phase from which it is asked; it learns from the start."""
     probe_samples: int = 40
     """Samples a ray that look for the surface, without gradient."""
     fine_samples: int = 16

@@ -11,7 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from stages.fitting.batches import draw, step_generator
+from stages.fitting.active import Uncertainty, most_uncertain
+from stages.fitting.batches import Batch, draw, step_generator
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
 from stages.fitting.renew import renew_bones, renew_bounds
@@ -36,6 +37,11 @@ class Trainer:
         self.model, self.observations, self.settings, self.team = model, observations, settings, team
         self.step_idx = 0
         self.rate_scale = 1.0
+        self.uncertainty: Uncertainty | None = None
+        if settings.active_share > 0:
+            octaves = model.architecture.octaves
+            self.uncertainty = Uncertainty(len(model.videos), octaves, step_generator(settings.seed, 0, rank=7))
+            self.uncertainty.to(self.device)
         model.use_delta = model.use_delta or settings.delta_from <= 0
         self._agree()
         self.refresh()
@@ -64,6 +70,7 @@ class Trainer:
             "root": (list(m.root.parameters()), s.lr_root),
             "focal": ([m.log_focal], s.lr_focal),
             "delta": (list(m.delta.parameters()), s.lr_delta),
+            "uncertainty": (list(self.uncertainty.parameters()) if self.uncertainty else [], 2e-3),
         }
 
     def _optimiser(self) -> torch.optim.Adam:
@@ -71,7 +78,7 @@ class Trainer:
         for name, (parameters, rate) in self.groups().items():
             for parameter in parameters:
                 parameter.requires_grad_(rate > 0)
-            if rate > 0:
+            if rate > 0 and parameters:
                 groups.append({"params": parameters, "lr": rate, "base": rate, "name": name})
         return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-10)
 
@@ -107,9 +114,9 @@ class Trainer:
         if self.progress >= s.delta_from:
             model.use_delta = True
         generator = step_generator(s.seed, self.step_idx)
-        batch = draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator).to(self.device)
+        batch = self._draw(generator)
         beta = max(beta_at(s, self.progress), model.beta_floor)
-        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator, self.team)
+        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator, self.team, self.uncertainty)
         total = torch.stack(list(terms.values())).sum()
         whole = torch.stack([value.detach() for value in terms.values()])
         self.team.sum([whole])
@@ -139,6 +146,21 @@ class Trainer:
         groups = self.optimiser.param_groups
         self.team.sum([p.grad for group in groups for p in group["params"] if p.grad is not None])
 
+    def _draw(self, generator: torch.Generator) -> Batch:
+        """The step's batch. Later in the phase some pixels of each frame are the most uncertain of many candidates."""
+        s = self.settings
+        active = round(s.active_share * s.pixels_per_frame) if self.progress >= s.active_from else 0
+        if self.uncertainty is None or not active:
+            return draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator, s.edge_share).to(
+                self.device
+            )
+        plain = s.pixels_per_frame - active
+        batch = draw(self.observations, s.frames_per_step, plain + 4 * active, generator, s.edge_share).to(self.device)
+        with torch.no_grad():
+            expected = self.uncertainty.of(self.model, batch)
+        keep = torch.arange(plain, device=self.device).expand(s.frames_per_step, -1)
+        return batch.pixels_of(torch.cat([keep, plain + most_uncertain(expected[:, plain:], active)], 1))
+
     def _renew(self) -> None:
         """Bones and box anew on the shape as it is now; the optimiser starts afresh, as the parameters are new."""
         self.refresh()
@@ -156,6 +178,8 @@ class Trainer:
         """All tensors a resume needs: model, optimiser moments, boxes, counters."""
         out = {f"model.{k}": v.clone() for k, v in self.model.state_dict().items()}
         out["boxes"] = self.boxes.clone()
+        if self.uncertainty is not None:
+            out |= {f"uncertainty.{k}": v.clone() for k, v in self.uncertainty.state_dict().items()}
         out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta)])
         out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
         for g, group in enumerate(self.optimiser.param_groups):
@@ -174,6 +198,9 @@ class Trainer:
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])
         self.rate_scale = float(state["rate_scale"][0])
+        if self.uncertainty is not None:
+            prefix = "uncertainty."
+            self.uncertainty.load_state_dict({k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)})
         self.optimiser = self._optimiser()
         for g, group in enumerate(self.optimiser.param_groups):
             for p, parameter in enumerate(group["params"]):

@@ -47,6 +47,7 @@ class Architecture:
     root_width: int = 64
     env_code: int = 16
     octaves: int = 5
+    splines: int = 0
 
 
 class FrameState(NamedTuple):
@@ -95,7 +96,7 @@ class Banmo(nn.Module):
         else:
             self.field = MlpField(bounds, a.env_code, a.mlp_depth, a.mlp_width)
         self.bones = bones
-        self.body = BodyPose(count, len(bones), a.octaves, a.pose_code, a.pose_width, generator)
+        self.body = BodyPose(count, len(bones), a.octaves, a.pose_code, a.pose_width, generator, a.splines)
         self.root = RootPose(count, max(2, a.octaves - 1), a.root_code, a.root_width, generator)
         self.environment = FourierCode(count, a.env_code, 2, generator)
         self.delta = DeltaSkinning(len(bones), a.pose_code)

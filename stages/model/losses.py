@@ -20,6 +20,14 @@ def silhouette_loss(opacity: Tensor, mask: Tensor, weight: Tensor) -> Tensor:
     return ((opacity - mask).square() * weight).mean()
 
 
+def ray_error(colour: Tensor, rgb: Tensor, opacity: Tensor, mask: Tensor, weight: Tensor) -> Tensor:
+    """Error a ray (...): colour (..., 3) weighted by `weight` (...), plus that of opacity against the mask (...).
+
+    What active sampling learns. The paper's is colour alone; outlines say more about where limbs are missing.
+    """
+    return (colour - rgb).abs().mean(-1) * weight + (opacity - mask).square()
+
+
 def huber(error: Tensor, corner: float, cap: float) -> Tensor:
     """Huber function of non-negative `error`: quadratic to `corner`, then linear, constant beyond `cap`."""
     error = error.clamp_max(cap)

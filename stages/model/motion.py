@@ -21,6 +21,19 @@ def octaves_for(duration_s: float, shortest_period_s: float) -> int:
     return min(10, max(2, 1 + round(math.log2(max(ratio, 1.0)))))
 
 
+def spline_basis(time: Tensor, count: int) -> Tensor:
+    """Uniform cubic B-splines (N, count) over [-1, 1] at times (N,): they sum to one, each spans four spacings."""
+    spacing = 2 / (count - 3)
+    centre = -1 + spacing * (torch.arange(count, dtype=time.dtype, device=time.device) - 1)
+    x = ((time[:, None] - centre) / spacing).abs()
+    return torch.where(x < 1, 2 / 3 - x * x * (1 - x / 2), (2 - x).clamp_min(0) ** 3 / 6)
+
+
+def splines_for(duration_s: float, spacing_s: float) -> int:
+    """How many splines span a clip of `duration_s` at about `spacing_s`; none if that is zero."""
+    return 0 if spacing_s <= 0 else max(4, 3 + round(max(duration_s, 1e-3) / spacing_s))
+
+
 def fourier_basis(time: Tensor, octaves: int) -> Tensor:
     """F(t) (N, 2 + 2K) of times (N,) in [-1, 1]."""
     phase = time[:, None] * (math.pi * 2.0 ** torch.arange(octaves, dtype=time.dtype, device=time.device))
@@ -28,20 +41,29 @@ def fourier_basis(time: Tensor, octaves: int) -> Tensor:
 
 
 class FourierCode(nn.Module):
-    """``omega_v(t) = A_v F(t)`` of C channels for V videos; higher octaves begin smaller."""
+    """``omega_v(t) = A_v F(t)`` of C channels for V videos; higher octaves begin smaller.
 
-    def __init__(self, videos: int, channels: int, octaves: int, generator: torch.Generator) -> None:
+    Octaves leave gaps between their frequencies. `splines` more functions, each alive for a moment, fill them.
+    """
+
+    def __init__(self, videos: int, channels: int, octaves: int, generator: torch.Generator, splines: int = 0) -> None:
         super().__init__()
-        self.octaves = octaves
+        self.octaves, self.splines = octaves, splines
         size = 2.0 ** -torch.arange(octaves, dtype=torch.float32).clamp_max(6) * 0.5 + 0.05
         scale = torch.cat([torch.ones(2), size, size])
         noise = torch.randn(videos, 2 + 2 * octaves, channels, generator=generator)
-        self.coefficients = nn.Parameter(noise * scale[:, None])
+        self.coefficients = nn.Parameter(
+            torch.cat([noise * scale[:, None], noise.new_zeros(videos, splines, channels)], 1)
+        )
+
+    def basis(self, time: Tensor) -> Tensor:
+        """F(t) (N, 2 + 2K + splines) of times (N,) in [-1, 1]."""
+        basis = fourier_basis(time, self.octaves)
+        return torch.cat([basis, spline_basis(time, self.splines)], 1) if self.splines else basis
 
     def forward(self, video_idx: Tensor, time: Tensor) -> Tensor:
         """Codes (N, C) at `time` (N,) of videos `video_idx` (N,)."""
-        basis = fourier_basis(time, self.octaves)
-        return torch.einsum("nk,nkc->nc", basis, self.coefficients[video_idx])
+        return torch.einsum("nk,nkc->nc", self.basis(time), self.coefficients[video_idx])
 
 
 class MotionHead(nn.Module):
@@ -73,10 +95,17 @@ class BodyPose(nn.Module):
     """
 
     def __init__(
-        self, videos: int, bones: int, octaves: int, code: int, width: int, generator: torch.Generator
+        self,
+        videos: int,
+        bones: int,
+        octaves: int,
+        code: int,
+        width: int,
+        generator: torch.Generator,
+        splines: int = 0,
     ) -> None:
         super().__init__()
-        self.code = FourierCode(videos, code, octaves, generator)
+        self.code = FourierCode(videos, code, octaves, generator, splines)
         self.head = MotionHead(code, bones, width, translation_scale=0.3)
 
     def forward(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
@@ -106,3 +107,40 @@ def test_frames_without_a_mask_count_for_nothing() -> None:
     hidden = scene(sphere(0.3, torch.tensor([40.0, 0, 0])), frames=2)
     assert not hidden.observations.frame_weight.any()
     assert hidden.observations.offsets.tolist() == [0, 0, 0, 0, 0]
+
+
+def test_the_rows_near_the_edge_come_first_and_can_be_drawn_alone(seen: Scene) -> None:
+    packed = seen.observations
+    margin = 4.0
+    for f in (0, 7):
+        mask = seen.masks[f] > 127
+        distance = torch.from_numpy(np.where(mask, distance_transform_edt(mask), distance_transform_edt(~mask)))
+        rows = slice(int(packed.offsets[f]), int(packed.offsets[f + 1]))
+        x, y = packed.xy[rows].long().T
+        near = distance[y, x] <= margin / 2
+        count = int(packed.edge_count[f])
+        assert 0 < count < len(near) and near[:count].all() and not near[count:].any()
+    batch = draw(packed, 30, 40, step_generator(0, 3), edge_share=0.5)
+    shares = []
+    for i, f in enumerate(batch.frame_idx.tolist()):
+        mask = seen.masks[f] > 127
+        distance = torch.from_numpy(np.where(mask, distance_transform_edt(mask), distance_transform_edt(~mask)))
+        x, y = (batch.pixels[i] - 0.5).long().T
+        near = distance[y, x] <= margin / 2
+        assert near[:20].all()
+        shares.append(float(near[20:].float().mean()))
+    assert 0.1 < sum(shares) / len(shares) < 0.9
+
+
+def test_picked_pixels_are_those_of_the_batch(seen: Scene) -> None:
+    batch = draw(seen.observations, 3, 12, step_generator(0, 4))
+    columns = torch.tensor([[11, 0], [5, 5], [2, 7]])
+    picked = batch.pixels_of(columns)
+    for f in range(3):
+        for i, column in enumerate(columns[f]):
+            assert torch.equal(picked.pixels[f, i], batch.pixels[f, column])
+            assert torch.equal(picked.rgb[f, i], batch.rgb[f, column])
+            assert torch.equal(picked.flow[f, i], batch.flow[f, column])
+            assert picked.features is not None and batch.features is not None
+            assert torch.equal(picked.features[f, i], batch.features[f, column])
+    assert picked.frame_idx is batch.frame_idx

@@ -9,7 +9,17 @@ import torch
 
 from stages.geometry.cameras import transform
 from stages.geometry.rotations import rigid, so3_exp
-from stages.model.motion import BodyPose, FourierCode, MotionHead, RootPose, chain, fourier_basis, octaves_for
+from stages.model.motion import (
+    BodyPose,
+    FourierCode,
+    MotionHead,
+    RootPose,
+    chain,
+    fourier_basis,
+    octaves_for,
+    spline_basis,
+    splines_for,
+)
 
 CENTRES = torch.tensor([[0.0, 0, 0], [0.4, 0, 0], [0.8, 0.1, 0], [0.0, 0.5, 0]])
 PARENTS = torch.tensor([0, 0, 1, 0])
@@ -135,3 +145,30 @@ def test_root_correction_turns_the_object_where_it_stands() -> None:
     half = root(video, time, base, torch.full((1,), 0.5))[0]
     assert torch.allclose(half[:3, :3], so3_exp(0.5 * motion[0, :3]) @ base[0, :3, :3], atol=1e-6)
     assert torch.equal(root(video, time, base, torch.zeros(1)), base)
+
+
+def test_splines_sum_to_one_and_live_for_a_moment() -> None:
+    time = torch.linspace(-1, 1, 201)
+    basis = spline_basis(time, 11)
+    assert torch.allclose(basis.sum(1), torch.ones(201), atol=1e-5)
+    spacing = 2 / 8
+    for k in range(11):
+        alive = time[basis[:, k] > 1e-7]
+        assert float(alive.max() - alive.min()) < 4 * spacing
+    assert splines_for(3.7, 0.1) == 40 and splines_for(3.7, 0.0) == 0 and splines_for(0.01, 1.0) == 4
+
+
+def test_splines_follow_what_octaves_cannot() -> None:
+    """A wave between two octaves, by least squares."""
+    time = torch.linspace(-1, 1, 75)
+    wave = torch.sin(11 * math.pi * time)
+    code = FourierCode(1, 2, 5, torch.Generator().manual_seed(0), splines=40)
+
+    def residual(basis: torch.Tensor) -> float:
+        solution = torch.linalg.lstsq(basis, wave[:, None]).solution
+        return float((basis @ solution - wave[:, None]).abs().max())
+
+    assert code.basis(time).shape == (75, 52)
+    assert residual(code.basis(time).detach()) < 0.05 < residual(fourier_basis(time, 5))
+    waves = fourier_basis(time, 5) @ code.coefficients[0, :12]  # splines start silent
+    assert torch.allclose(code(torch.zeros(75, dtype=torch.int64), time), waves, atol=1e-5)

@@ -23,7 +23,7 @@ from tests.numerics.analytic_scene import model_of, scene, sphere, stir, tiny_se
 
 STEPS = 7
 # Five frames a step do not halve: the processes' shares differ, and so must their weights.
-SETTINGS = tiny_settings(iterations=STEPS, frames_per_step=5, renew_at=4 / STEPS, delta_from=0.3)
+SETTINGS = tiny_settings(iterations=STEPS, frames_per_step=5, renew_at=4 / STEPS, delta_from=0.3, active_share=0.25)
 PATIENCE_S = 240
 
 

@@ -17,7 +17,9 @@ from tests.numerics.analytic_scene import Scene, model_of, scene, sphere, stir, 
 
 STEPS = 9
 RENEW = 5
-SETTINGS = tiny_settings(iterations=STEPS, renew_at=RENEW / STEPS, delta_from=0.3)
+SETTINGS = tiny_settings(
+    iterations=STEPS, renew_at=RENEW / STEPS, delta_from=0.3, edge_share=0.25, active_share=0.25, active_from=0.3
+)
 
 
 def ball(points: torch.Tensor) -> torch.Tensor:
