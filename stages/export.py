@@ -157,7 +157,7 @@ def export_model(
     except CleanerMissing as error:
         hint = "pip install banmo-pipeline[clean], or cleaner = builtin"
         raise BadInput("[export] cleaner: pymeshlab is not installed", hint=hint) from error
-    rig = replace(rig, skeleton=name_by_place(rig.skeleton, settings.category))
+    rig = replace(rig, skeleton=name_by_place(rig.skeleton, settings.category, rig.mesh.vertices, rig.weights))
     run.log.info("surface: %d faces, %d joints", len(rig.mesh.faces), len(rig.skeleton))
     shown = shown_pose(rig, names, clips, settings.rest_frame, kept)
     colours = [surface_colour(model, rig, k) for k in range(len(inputs))]

@@ -62,9 +62,10 @@ class RiggedMesh:
 
     vertices, normals: (V, 3); faces: (F, 3); colour: (V, 3) sRGB in 0..1;
     joint_idx, weight: (V, K) skin, descending; padded to a multiple of four here.
-    uv: (V, 2) and texture_png: the colour as a picture. With it the vertex colours become the attribute ``_COLOR``,
-    since a viewer would multiply COLOR_0 with the texture.
-    seen: (V,) share of the frames that saw each vertex, 0 for never: the attribute ``_SEEN``.
+    uv: (V, 2) and texture_png: the colour as a picture. With it the vertex colours are COLOR_1 and COLOR_0 is white,
+    since a viewer multiplies COLOR_0 with the texture.
+    seen: (V,) share of the frames that saw each vertex, 0 for never: the attribute ``_SEEN``. It stays the only one of
+    our own: Blender's importer fails on two of different shapes.
     """
 
     name: str
@@ -231,11 +232,11 @@ def _primitive(builder: _Builder, mesh: RiggedMesh, joint_count: int) -> dict[st
     }
     if mesh.uv is not None and mesh.texture_png is not None:
         attributes["TEXCOORD_0"] = builder.add(mesh.uv.astype(np.float32), _VERTEX_DATA)
-        colour[:, :3] = np.clip(mesh.colour, 0, 1)  # nobody but people reads this one: sRGB
-        attributes["_COLOR"] = builder.add(np.round(colour * 255).astype(np.uint8), _VERTEX_DATA, normalised=True)
-    else:
-        colour[:, :3] = linear_from_srgb(mesh.colour)
-        attributes["COLOR_0"] = builder.add(np.round(colour * 65535).astype(np.uint16), _VERTEX_DATA, normalised=True)
+        white = np.full((vertex_count, 4), 255, np.uint8)
+        attributes["COLOR_0"] = builder.add(white, _VERTEX_DATA, normalised=True)
+    colour[:, :3] = linear_from_srgb(mesh.colour)
+    name = f"COLOR_{sum(a.startswith('COLOR_') for a in attributes)}"
+    attributes[name] = builder.add(np.round(colour * 65535).astype(np.uint16), _VERTEX_DATA, normalised=True)
     if mesh.seen is not None:
         attributes["_SEEN"] = builder.add(mesh.seen.astype(np.float32), _VERTEX_DATA)
     for part in range(-(-kept // 4)):

@@ -6,13 +6,15 @@ Canonical space has y up, z front and x to the object's left; names are as good 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stages.meshing.skeleton import Skeleton
 
 CATEGORIES = ("quadruped", "human")
+_ON_THE_GROUND = 0.08  # of the height
+_BOTH_SIDES = 0.02  # of the length
 _SAME = {"dog": "quadruped", "cat": "quadruped", "horse": "quadruped", "animal": "quadruped", "person": "human"}
 
 
@@ -23,26 +25,29 @@ def kind_of_body(category: str) -> str | None:
     return word if word in CATEGORIES else None
 
 
-def name_by_place(skeleton: Skeleton, category: str) -> Skeleton:
+def name_by_place(skeleton: Skeleton, category: str, vertices: np.ndarray, weights: np.ndarray) -> Skeleton:
     """The same joints, called ``spine_1``, ``leg_front_left_2`` ...; unchanged where the category tells nothing.
 
-    A limb is a chain of joints from the last fork of the tree out to a tip; it is named by where its tip lies in the
-    box of all bones, and its joints are counted from the body outward. What lies in no limb is the spine, counted from
-    the back to the front (quadruped) or from below upward (human).
+    A limb is a chain of joints from the last fork of the tree out to a tip; it is named by where the surface that its
+    tip moves lies in the object's box, and its joints are counted from the body outward. What lies in no limb is the
+    spine, counted from the back to the front (quadruped) or from below upward (human). A limb that moves both sides
+    alike (two legs on one bone) has no side in its name.
+
+    Args:
+        vertices: (V, 3) at rest. weights: (V, B) skinning weights, in the model's bone order.
     """
     kind = kind_of_body(category)
     if kind is None or len(skeleton) < 3:
         return skeleton
-    place = _relative(skeleton.centre)
-    limb_of: dict[int, str] = {}
+    parts = _parts(skeleton, vertices, weights)
     chains = sorted(_limbs(skeleton.parent), key=lambda chain: (-len(chain), chain[0]))
-    tips = np.array([place[chain[-1]] for chain in chains])
-    for chain, label in zip(chains, _labels(kind, chains, tips, place), strict=True):
+    limb_of: dict[int, str] = {}
+    for chain, label in zip(chains, _labels(kind, chains, parts), strict=True):
         if label is not None:
             limb_of |= dict.fromkeys(chain, label)
     trunk = [j for j in range(len(skeleton)) if j not in limb_of]
     along = 2 if kind == "quadruped" else 1
-    order = sorted(trunk, key=lambda j: (place[j, along], j))
+    order = sorted(trunk, key=lambda j: (parts[j].middle[along], j))
     labels = {j: f"spine_{n}" for n, j in enumerate(order, 1)}
     count: Counter[str] = Counter()
     for chain in chains:
@@ -53,13 +58,35 @@ def name_by_place(skeleton: Skeleton, category: str) -> Skeleton:
     return replace(skeleton, names=[labels[j] for j in range(len(skeleton))])
 
 
-def _relative(centre: np.ndarray) -> np.ndarray:
-    """Places (B, 3): y and z over the box of the bones, 0 to 1; x from the middle over the largest edge."""
-    low, high = centre.min(axis=0), centre.max(axis=0)
-    place = (centre - low) / np.maximum(high - low, 1e-9)
-    middle = np.median(centre[:, 0])
-    place[:, 0] = (centre[:, 0] - middle) / max(float((high - low).max()), 1e-9)
-    return np.asarray(place)
+@dataclass(frozen=True)
+class _Part:
+    """The surface that a joint moves most: its middle and its lowest height, in the object's box.
+
+    y and z run over 0..1; x runs from the body's middle, over the box's largest edge.
+    """
+
+    middle: np.ndarray
+    lowest: float
+
+
+def _parts(skeleton: Skeleton, vertices: np.ndarray, weights: np.ndarray) -> list[_Part]:
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    extent, axis = np.maximum(high - low, 1e-9), float(np.median(vertices[:, 0]))
+
+    def relative(points: np.ndarray) -> np.ndarray:
+        place = (points - low) / extent
+        place[..., 0] = (points[..., 0] - axis) / extent.max()
+        return np.asarray(place)
+
+    strongest = weights.argmax(axis=1)
+    parts = []
+    for joint, bone in enumerate(skeleton.bone.tolist()):
+        own = vertices[strongest == bone]
+        if not len(own):
+            own = skeleton.centre[joint : joint + 1]
+        place = relative(own)
+        parts.append(_Part(place.mean(axis=0), float(np.quantile(place[:, 1], 0.02))))
+    return parts
 
 
 def _limbs(parent: np.ndarray) -> list[list[int]]:
@@ -74,38 +101,29 @@ def _limbs(parent: np.ndarray) -> list[list[int]]:
     return chains
 
 
-def _labels(kind: str, chains: list[list[int]], tips: np.ndarray, place: np.ndarray) -> list[str | None]:
-    if not chains:
-        return []
-    named: list[str | None] = []
-    low = tips[:, 1] < 0.35
+def _labels(kind: str, chains: list[list[int]], parts: list[_Part]) -> list[str | None]:
+    tips = [parts[chain[-1]] for chain in chains]
     if kind == "quadruped":
-        free = np.flatnonzero(~low)
-        head = int(free[tips[free, 2].argmax()]) if len(free) else -1
-        feet = tips[low, 2]
-        middle = float((feet.min() + feet.max()) / 2) if len(feet) else 0.5
-        for k, tip in enumerate(tips):
-            if low[k]:
-                named.append(f"leg_{'front' if tip[2] > middle else 'back'}_{_side(tip)}")
-            elif k == head or tip[2] > 0.75:
-                named.append("head")
-            elif tip[2] < 0.25:
-                named.append("tail")
+        feet = [tip.middle[2] for tip in tips if tip.lowest < _ON_THE_GROUND]
+        middle = (min(feet) + max(feet)) / 2 if feet else 0.5
+        named = []
+        for tip in tips:
+            if tip.lowest < _ON_THE_GROUND:
+                named.append(f"leg_{'front' if tip.middle[2] > middle else 'back'}{_side(tip)}")
             else:
-                named.append(None)
+                named.append("head" if tip.middle[2] > 0.75 else "tail" if tip.middle[2] < 0.25 else None)
         return named
-    top = int(tips[:, 1].argmax())
-    for k, tip in enumerate(tips):
-        if k == top or (tip[1] > 0.85 and abs(tip[0]) < 0.08):
+    named = []
+    for chain, tip in zip(chains, tips, strict=True):
+        if tip.lowest < _ON_THE_GROUND or (tip.middle[1] < 0.3 and parts[chain[0]].middle[1] < 0.6):
+            named.append(f"leg{_side(tip)}")
+        elif tip.middle[1] > 0.85:
             named.append("head")
-        elif low[k] and place[chains[k][0], 1] < 0.6:
-            named.append(f"leg_{_side(tip)}")
-        elif abs(tip[0]) > 0.06:
-            named.append(f"arm_{_side(tip)}")
         else:
-            named.append(None)
+            named.append(f"arm{_side(tip)}" if _side(tip) else None)
     return named
 
 
-def _side(tip: np.ndarray) -> str:
-    return "left" if tip[0] > 0 else "right"
+def _side(tip: _Part) -> str:
+    across = float(tip.middle[0])
+    return "" if abs(across) < _BOTH_SIDES else "_left" if across > 0 else "_right"

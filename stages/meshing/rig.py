@@ -17,7 +17,7 @@ from stages.meshing.surface import EmptySurface, Mesh, SurfaceFacts, clean_surfa
 
 _POINTS_PER_WARP = 150_000
 _FIT_FRAMES = 150  # of all clips together, to fit the skin to
-_SKIN_TOLERANCE = 7e-4  # of the length: vertices that are farther off in some frame are fitted again
+_SKIN_TOLERANCE = 5e-4  # of the length: vertices that are farther off in some frame are fitted again
 
 
 class Animatable(Protocol):
