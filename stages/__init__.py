@@ -1,6 +1,6 @@
 """Videos in, animated model out: the stages in the order of the data. Start reading here.
 
-videos -> frames -> masks, flow, features -> poses -> fit -> correct -> refine -> export
+videos -> frames -> masks, flow, features -> poses -> fit -> correct -> refine -> export -> report
 
 Each entry is ``module:function``; the engine imports them by name, so that editing one stage never touches the
 code fingerprint of another.
@@ -16,6 +16,7 @@ PIPELINE = (
     "stages.optimise:correct",
     "stages.optimise:refine",
     "stages.export:export",
+    "stages.report:report",
 )
 """The pipeline, in data order."""
 
@@ -25,7 +26,11 @@ GROUPS = {"optimise": ("fit", "correct", "refine")}
 PRESETS = "presets.toml"
 """Settings by purpose, beside this file; the first table is the default preset."""
 
+EXPORTS = ("export", "report")
+"""Stages whose files are copied to ``exports/``."""
+
 VERBS = {
+    "evaluate": "stages.verbs.evaluate",
     "retarget": "stages.verbs.retarget",
 }
 """Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""
