@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,8 @@ from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection, collect
 from stages.fitting import initialise
+from stages.fitting.budget import affordable_steps
+from stages.fitting.diagnose import misfits
 from stages.fitting.gauge import settle
 from stages.fitting.preview import preview_sheet
 from stages.fitting.schedule import PhaseSettings
@@ -245,9 +247,12 @@ def _run_phase(
         )
     device = _device(run)
     with joined(run.rank, run.world_size, device) as team:
-        model, history = _train(model.to(device), collection, settings, checkpoints, run, team, label)
+        trainer, history = _train(model.to(device), collection, settings, checkpoints, run, team, label)
     if not team.leads:
         return
+    model = trainer.model
+    if isinstance(settings, RefineSettings):
+        _diagnose(trainer, collection, out, run)
     if isinstance(settings, FitSettings) and settings.settle_root:
         run.metric("root_settled_deg", round(math.degrees(settle(model)), 3))
     _write_folder(model.to("cpu"), collection, history, out)
@@ -271,8 +276,8 @@ def _train(
     run: Run,
     team: Team,
     label: str,
-) -> tuple[Banmo, list[dict[str, float]]]:
-    """Train from the last checkpoint to the end; the leader of the team writes, all read. Returns the last metrics."""
+) -> tuple[Trainer, list[dict[str, float]]]:
+    """Train from the last checkpoint to the end; the leader of the team writes, all read. Returns metrics, too."""
     device = model.base_poses.device
     trainer = Trainer(model, collection.observations, settings, team)
     history: list[dict[str, float]] = []
@@ -280,6 +285,13 @@ def _train(
     if saved is not None:
         trainer.restore(saved.tensors)
         history = saved.history
+        settings = replace(settings, iterations=int(saved.tensors["counters"][2]))
+        trainer.settings = settings
+    elif settings.minutes > 0:
+        steps = team.agree(torch.tensor([affordable_steps(trainer, settings.minutes)], device=device))
+        settings = replace(settings, iterations=int(steps))
+        trainer.settings = settings
+        run.metric("steps", settings.iterations)
     team.wait()  # until all have read the same checkpoint
     setbacks = 0
 
@@ -316,7 +328,34 @@ def _train(
             save()
             if team.leads and run.device == "cpu":
                 _write_preview(model, collection, checkpoints.root / "preview.png")
-    return model, history
+    return trainer, history
+
+
+def _diagnose(trainer: Trainer, collection: Collection, out: Path, run: Run) -> None:
+    """``diagnosis.json``: how well each frame is explained; a warning names those far worse than their clip."""
+    figures = trainer.figures()
+    bad = misfits(figures.overlap, collection.observations.video_idx)
+    videos: dict[str, dict[str, list[float | None] | list[str] | list[bool]]] = {}
+    start = 0
+    for i, (name, clip) in enumerate(collection.clips.items()):
+        mine = slice(start, start + len(clip))
+        start += len(clip)
+        values = {key: _plain(getattr(figures, key)[mine]) for key in ("overlap", "flow_px", "feature")}
+        confidence = _plain(torch.as_tensor(collection.confidence[i]))
+        videos[name] = {"frames": clip.names, **values, "root_confidence": confidence, "misfit": bad[mine].tolist()}
+        known = figures.overlap[mine][~figures.overlap[mine].isnan()]
+        if len(known):
+            run.metric(f"overlap_{name}", round(float(known.median()), 4))
+        worst = [n for n, b in zip(clip.names, bad[mine].tolist(), strict=True) if b]
+        if worst:
+            some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
+            run.warn(f"{name}: {len(worst)} of {len(clip)} frames fit far worse than the rest of the clip ({some})")
+    formats.write_json(out / "diagnosis.json", {"videos": videos})
+
+
+def _plain(values: torch.Tensor) -> list[float | None]:
+    """Rounded for people; NaN, where there was nothing to compare with, becomes null."""
+    return [None if math.isnan(v) else round(v, 4) for v in values.double().tolist()]
 
 
 def _write_folder(model: Banmo, collection: Collection, history: list[dict[str, float]], out: Path) -> None:

@@ -77,6 +77,14 @@ def draw(
     Of a frame's pixels the first `edge_share` are drawn near the mask's edge alone, where limbs and outlines are.
     """
     chosen = torch.multinomial(observations.frame_weight, frames, replacement=True, generator=generator)
+    return look(observations, chosen, pixels, generator, edge_share)
+
+
+def look(
+    observations: Observations, chosen: Tensor, pixels: int, generator: torch.Generator, edge_share: float = 0.0
+) -> Batch:
+    """`pixels` of each of the frames `chosen` (F,), drawn as :func:`draw` does."""
+    frames = len(chosen)
     start, count = observations.offsets[chosen], observations.offsets[chosen + 1] - observations.offsets[chosen]
     unit = torch.rand(frames, pixels, generator=generator)
     count = count[:, None].repeat(1, pixels)

@@ -12,6 +12,8 @@ class PhaseSettings:
 
     iterations: int = 600
     """Steps of gradient descent. The whole schedule is laid out over them: a short run is a finished run."""
+    minutes: float = 0.0
+    """Time for the phase: as many steps as this machine makes in it, schedule and all; 0 = as many as `iterations`."""
     seed: int = 0
     """Seed of every random draw."""
 
@@ -95,6 +97,9 @@ class PhaseSettings:
     """Share of the phase from which skinning is corrected by a network; above 1 = never."""
     renew_at: float = 2.0
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
+    reject_at: float = 2.0
+    """Share of the phase at which frames that fit far worse than their clip are trusted less and, where root poses are
+    free, placed between their neighbours; above 1 = never."""
     update_bounds_every: int = 200
     """Steps between updates of the surface, each frame's near and far planes, and the matching grid's bounds."""
 

@@ -7,12 +7,14 @@ Resuming is exact: all randomness comes from (seed, step), and everything a step
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from stages.fitting.active import Uncertainty, most_uncertain
 from stages.fitting.batches import Batch, draw, step_generator
+from stages.fitting.diagnose import FrameFigures, frame_figures, misfits, replace_from_neighbours
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
 from stages.fitting.renew import renew_bones, renew_bounds
@@ -37,6 +39,7 @@ class Trainer:
         self.model, self.observations, self.settings, self.team = model, observations, settings, team
         self.step_idx = 0
         self.rate_scale = 1.0
+        self.trust = torch.ones(len(observations))
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
             octaves = model.architecture.octaves
@@ -111,6 +114,8 @@ class Trainer:
             self.refresh()
         if self.step_idx and self.step_idx == round(s.renew_at * s.iterations):
             self._renew()
+        if self.step_idx and self.step_idx == round(s.reject_at * s.iterations):
+            self._reject()
         if self.progress >= s.delta_from:
             model.use_delta = True
         generator = step_generator(s.seed, self.step_idx)
@@ -146,16 +151,30 @@ class Trainer:
         groups = self.optimiser.param_groups
         self.team.sum([p.grad for group in groups for p in group["params"] if p.grad is not None])
 
+    def figures(self) -> FrameFigures:
+        """How well each frame is explained as things stand."""
+        beta = max(beta_at(self.settings, self.progress), self.model.beta_floor)
+        return frame_figures(self.model, self.observations, self.boxes, self.settings, beta)
+
+    def _reject(self) -> None:
+        """Frames that fit far worse than their clip count for a tenth from now on."""
+        bad = misfits(self.figures().overlap, self.observations.video_idx)
+        self.trust = self.team.agree(torch.where(bad, self.trust * 0.1, self.trust).to(self.device)).cpu()
+        if replace_from_neighbours(self.model, self.trust < 1):
+            self._agree()
+            self.refresh()
+
+    def _trusted(self) -> Observations:
+        return replace(self.observations, frame_weight=self.observations.frame_weight * self.trust)
+
     def _draw(self, generator: torch.Generator) -> Batch:
         """The step's batch. Later in the phase some pixels of each frame are the most uncertain of many candidates."""
         s = self.settings
         active = round(s.active_share * s.pixels_per_frame) if self.progress >= s.active_from else 0
         if self.uncertainty is None or not active:
-            return draw(self.observations, s.frames_per_step, s.pixels_per_frame, generator, s.edge_share).to(
-                self.device
-            )
+            return draw(self._trusted(), s.frames_per_step, s.pixels_per_frame, generator, s.edge_share).to(self.device)
         plain = s.pixels_per_frame - active
-        batch = draw(self.observations, s.frames_per_step, plain + 4 * active, generator, s.edge_share).to(self.device)
+        batch = draw(self._trusted(), s.frames_per_step, plain + 4 * active, generator, s.edge_share).to(self.device)
         with torch.no_grad():
             expected = self.uncertainty.of(self.model, batch)
         keep = torch.arange(plain, device=self.device).expand(s.frames_per_step, -1)
@@ -180,7 +199,8 @@ class Trainer:
         out["boxes"] = self.boxes.clone()
         if self.uncertainty is not None:
             out |= {f"uncertainty.{k}": v.clone() for k, v in self.uncertainty.state_dict().items()}
-        out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta)])
+        out["trust"] = self.trust.clone()
+        out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta), self.settings.iterations])
         out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
         for g, group in enumerate(self.optimiser.param_groups):
             for p, parameter in enumerate(group["params"]):
@@ -194,6 +214,7 @@ class Trainer:
         tensors = {k.removeprefix("model."): v for k, v in state.items() if k.startswith("model.")}
         self.model.surface = torch.zeros_like(tensors["surface"], device=self.device)
         self.model.load_state_dict(tensors)
+        self.trust = state["trust"].cpu().clone()
         self.boxes = state["boxes"].to(self.device, copy=True)
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])

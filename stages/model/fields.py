@@ -67,9 +67,7 @@ class GridField(nn.Module):
 
     def node_positions(self) -> Tensor:
         """Positions (Z, Y, X, 3) of the finest grid's nodes."""
-        axes = [
-            torch.linspace(float(self.bounds[0, k]), float(self.bounds[1, k]), self.shape[2 - k]) for k in range(3)
-        ]
+        axes = [torch.linspace(float(self.bounds[0, k]), float(self.bounds[1, k]), self.shape[2 - k]) for k in range(3)]
         z, y, x = torch.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
         return torch.stack([x, y, z], -1).to(self.bounds.device)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -179,3 +180,41 @@ def test_divergence_that_stays_is_an_error(
         work(collection, tmp_path / "out", run)
     assert 1 <= len(run.warnings) <= 3
     assert not any((tmp_path / "out").iterdir())
+
+
+def test_a_phase_given_minutes_lays_its_schedule_over_the_steps_they_buy(
+    collection: Collection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bought = iter([6, 99])
+    monkeypatch.setattr(optimise, "affordable_steps", lambda *_: next(bought))
+    settings = tiny_settings(iterations=500, pixels_per_frame=12, minutes=2.0)
+    checkpoints = Checkpoints(tmp_path / "points")
+    run = StopsAfter(3, tmp_path / "points")
+    with pytest.raises(Interrupted):
+        optimise._run_phase(first_model(), collection, settings, checkpoints, tmp_path / "out", run, "fitting")
+    saved = checkpoints.latest()
+    assert saved is not None and saved.step == 3
+    model = Banmo.restore(saved.model_tensors(), saved.description)
+    out = tmp_path / "out"
+    out.mkdir()
+    optimise._run_phase(
+        model, collection, settings, checkpoints, out, Run(checkpoint_dir=tmp_path / "points"), "fitting"
+    )
+    last = json.loads((out / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 6  # what was bought at the start holds after a stop
+
+
+def test_refinement_tells_how_each_frame_fits(collection: Collection, tmp_path: Path) -> None:
+    small = {"frames_per_step": 4, "pixels_per_frame": 12, "probe_samples": 16, "fine_samples": 8}
+    settings = optimise.RefineSettings(iterations=1, **small)
+    run = Run(checkpoint_dir=tmp_path / "points")
+    optimise._run_phase(
+        first_model(), collection, settings, Checkpoints(tmp_path / "points"), tmp_path, run, "refining"
+    )
+    told = json.loads((tmp_path / "diagnosis.json").read_text())["videos"]
+    assert set(told) == {"clip0", "clip1"}
+    for name, figures in told.items():
+        assert figures["frames"] == collection.clips[name].names
+        assert all(len(v) == FRAMES for v in figures.values())
+        assert all(0.5 < v <= 1 for v in figures["overlap"])
+        assert run.metrics[f"overlap_{name}"] > 0.5
