@@ -2,7 +2,8 @@
 
 The package that defines a pipeline names it in its ``__init__.py`` by three literals, read without importing it:
 ``PIPELINE`` (tuple of ``module:function``), ``GROUPS`` (name -> stages) and ``PRESETS`` (a TOML file beside it); a
-fourth, ``VERBS``, names commands of its own (:mod:`pipeline.verbs`).
+fourth, ``VERBS``, names commands of its own (:mod:`pipeline.verbs`); a fifth, ``EXPORTS``, the stages whose files a
+user gets (the last one where it is not there).
 """
 
 from __future__ import annotations
@@ -59,6 +60,8 @@ class Definition:
     groups: dict[str, tuple[str, ...]]
     presets: dict[str, dict[str, Any]]
     presets_path: Path | None
+    exported: tuple[str, ...] = ()
+    """Stages whose files are copied to ``exports/``: those that EXPORTS names, else the last."""
 
     @property
     def given_suffixes(self) -> tuple[str, ...]:
@@ -92,7 +95,11 @@ def load(package: str, cache: Path | None = None) -> Definition:
     presets = read_toml(presets_path) if presets_path else {}
     groups = {str(k): tuple(v) for k, v in (constants.get("GROUPS") or {}).items()}
     reader.save()
-    return Definition(root, stages, groups, presets, presets_path)
+    exported = tuple(str(name) for name in constants.get("EXPORTS") or [list(stages)[-1]])
+    for name in exported:
+        if name not in stages:
+            raise BadInput(f"EXPORTS names {name!r}, which is no stage", where=folder / "__init__.py")
+    return Definition(root, stages, groups, presets, presets_path, exported)
 
 
 def locate(package: str) -> Path:

@@ -1,7 +1,12 @@
-"""Real copies of the last stage's files in ``exports/``, swapped in whole; the user's own files there are kept."""
+"""Real copies of what a user holds in ``exports/``, swapped in whole; the user's own files there are kept.
+
+They are the files of the last stage, or of all stages that the pipeline names in ``EXPORTS``. In an HTML file among
+them an empty JSON element with the id ``provenance`` is filled with what no result may hold: times and reasons.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -14,15 +19,16 @@ from pipeline.ledger import Record
 from pipeline.objects import walk
 from pipeline.plan import Planner
 from pipeline.project import Project
+from pipeline.results import Results
 
 PROVENANCE = "provenance.json"
+_SLOT = '<script type="application/json" id="provenance">null</script>'
 
 
 def export(project: Project, planner: Planner, to: Path | None = None) -> Path | None:
-    """Copy the last stage's folder to ``exports/`` unless it is there already; None when it has no result."""
-    last = list(project.definition.stages)[-1]
-    nodes = project.graph.of_stage(last)
-    records = {n.video_name: planner.results[n.label] for n in nodes if n.label in planner.results}
+    """Copy the exported stages' folders to ``exports/`` unless they are there; None when one has no result."""
+    nodes = [node for stage in project.definition.exported for node in project.graph.of_stage(stage)]
+    records = {n.label: planner.results[n.label] for n in nodes if n.label in planner.results}
     if len(records) < len(nodes):
         return None
     target = (to or project.workspace.exports).resolve()  # a link to another disk stays a link
@@ -33,19 +39,22 @@ def export(project: Project, planner: Planner, to: Path | None = None) -> Path |
     return target
 
 
-def _export(project: Project, planner: Planner, records: dict[str | None, Record], target: Path) -> None:
+def _export(project: Project, planner: Planner, records: dict[str, Record], target: Path) -> None:
     if _is_there(target, records):
         return
     wanted, before = _wanted(records), _before(target)
     fresh = target.with_name(f".{target.name}-{unique()}")
     try:
         fresh.mkdir(parents=True)
-        for video, record in records.items():
+        for record in records.values():
             if not project.workspace.objects.sound(record.stage, record.digest):
                 raise BadInput(f"the result of {record.label} is damaged", hint="run again")
-            _copy(project.workspace.objects.path(record.stage, record.digest), fresh / video if video else fresh)
+            place = fresh / record.video if record.video else fresh
+            _copy(project.workspace.objects.path(record.stage, record.digest), place)
+        provenance = _provenance(project, wanted, planner.results)
+        _explain(fresh, provenance, project)
         files = {name: [s.st_size, s.st_mtime_ns] for name, _, s in walk(fresh)}
-        write_json(fresh / PROVENANCE, _provenance(project, wanted, files, planner.results))
+        write_json(fresh / PROVENANCE, {**provenance, "files": files})
         _keep_foreign(target, fresh, before["files"])
         retired = target.with_name(f".{target.name}-retired-{unique()}")
         if target.exists():
@@ -56,8 +65,25 @@ def _export(project: Project, planner: Planner, records: dict[str | None, Record
         remove_tree(fresh)
 
 
-def _wanted(records: dict[str | None, Record]) -> dict[str, str]:
-    return {video or "": record.digest for video, record in records.items()}
+def _wanted(records: dict[str, Record]) -> dict[str, str]:
+    return {label: record.digest for label, record in records.items()}
+
+
+def _explain(fresh: Path, provenance: dict[str, Any], project: Project) -> None:
+    """Fill the empty element of HTML files: what ran, how long, when and why; escaped so that it stays data."""
+    pages = [p for p in sorted(fresh.glob("*.html")) if _SLOT in p.read_text(encoding="utf-8", errors="replace")]
+    if not pages:
+        return
+    ran = [
+        {"stage": r.stage, "video": r.video, "seconds": round(r.seconds, 3), "when": r.when, "reason": r.reason}
+        for r in Results(project.workspace.root).records()
+    ]
+    text = json.dumps({**provenance, "ran": ran}, ensure_ascii=False, default=str)
+    for old, new in (("&", "\\u0026"), ("<", "\\u003c"), (">", "\\u003e")):
+        text = text.replace(old, new)
+    for path in pages:
+        page = path.read_text(encoding="utf-8")
+        path.write_text(page.replace(_SLOT, _SLOT.replace("null", "%s") % text), encoding="utf-8")
 
 
 def _before(target: Path) -> dict[str, Any]:
@@ -66,7 +92,7 @@ def _before(target: Path) -> dict[str, Any]:
     return value if isinstance(value, dict) and isinstance(value.get("files"), dict) else {"files": {}}
 
 
-def _is_there(target: Path, records: dict[str | None, Record]) -> bool:
+def _is_there(target: Path, records: dict[str, Record]) -> bool:
     before = _before(target)
     return before.get("digests") == _wanted(records) and _complete(target, before["files"])
 
@@ -99,14 +125,11 @@ def _keep_foreign(target: Path, fresh: Path, ours: dict[str, Any]) -> None:
         shutil.copy2(path, place, follow_symlinks=False)
 
 
-def _provenance(
-    project: Project, wanted: dict[str, str], files: dict[str, Any], results: dict[str, Record]
-) -> dict[str, Any]:
+def _provenance(project: Project, wanted: dict[str, str], results: dict[str, Record]) -> dict[str, Any]:
     return {
         "digests": wanted,
         "videos": {v.name: {"file": v.display, "sha256": project.sources.of(v.path)} for v in project.videos},
         "preset": project.settings.preset,
         "actions": {label: record.key for label, record in results.items()},
         "settings": {s: v for s, v in project.settings.values.items() if s in project.definition.stages},
-        "files": files,
     }

@@ -3,8 +3,8 @@
 Starting from the stage's module, imports are followed inside the package of the pipeline; every module is parsed,
 bare strings (docstrings) are dropped, comments and layout vanish with parsing, and what is left is hashed module by
 module. Modules are found by file path and nothing is imported. Parent packages run on import, so they belong to it;
-the lists that name the pipeline (PIPELINE, GROUPS, PRESETS, VERBS) do not count. Data files that a stage declares
-count with their bytes. Blind spots: imports made at run time by name, compiled extensions, other packages.
+the lists that name the pipeline (PIPELINE, GROUPS, PRESETS, VERBS, EXPORTS) do not count. Data files that a stage
+declares count with their bytes. Blind spots: imports made at run time by name, compiled extensions, other packages.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from pipeline.errors import BadInput, StageError
 from pipeline.files import read_json, sha256_file, signature, write_memo
 
-_NAMING = {"PIPELINE", "GROUPS", "PRESETS", "VERBS"}
+_NAMING = {"PIPELINE", "GROUPS", "PRESETS", "VERBS", "EXPORTS"}
 _MEMO_FORMAT = 3
 
 

@@ -194,11 +194,10 @@ def _blessed(step: Step, old: Record) -> Record:
 
 
 def export_command(args: argparse.Namespace, options: Options) -> int:
-    """Copy the last stage's files out."""
+    """Copy what a user holds out of the store."""
     project = open_quietly(options)
-    last = list(project.definition.stages)[-1]
     planner = project.planner()
-    nodes = nodes_named(project, last, None)
+    nodes = [node for stage in project.definition.exported for node in nodes_named(project, stage, None)]
     planner.plan(project.graph.needed(nodes))
     if (
         args.to is not None
@@ -209,7 +208,8 @@ def export_command(args: argparse.Namespace, options: Options) -> int:
         raise BadInput("this folder is not empty and not an earlier export", where=args.to, hint="name a new one")
     target = export(project, planner, args.to.absolute() if args.to else None)
     if target is None:
-        raise BadInput(f"{last} has no result that is up to date", hint="banmo run")
+        wanted = " and ".join(project.definition.exported)
+        raise BadInput(f"{wanted} has no result that is up to date", hint="banmo run")
     sys.stdout.write(f"exports: {target}\n")
     return ExitCode.DONE
 
