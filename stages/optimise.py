@@ -34,6 +34,14 @@ _CHECKPOINT_STEPS = 50
 _METRIC_STEPS = 10
 _HULL_VOXEL = 0.032
 
+_CHOICES = {
+    "representation": ("grid", "mlp"),
+    "start": ("hull", "sphere"),
+    "blending": ("linear", "dual_quaternion"),
+    "deformation": ("skinning", "se3", "translation"),
+    "rate": ("linear", "one_cycle"),
+}
+
 
 @dataclass(frozen=True)
 class FitSettings(PhaseSettings):
@@ -61,6 +69,10 @@ class FitSettings(PhaseSettings):
     """Spacing of local functions of time in the pose codes, beside the waves; 0 = waves alone, as in the paper."""
     pose_code: int = 96
     """Channels of the pose codes."""
+    blending: str = "linear"
+    """How bones are mixed: linear, or dual_quaternion (rigid at every point)."""
+    deformation: str = "skinning"
+    """skinning, or for comparison se3 or translation: a network moves every point; such a model has no rig."""
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
@@ -129,6 +141,7 @@ def fit(
     run: Run,
 ) -> None:
     """A first whole model of the collection: canonical shape and colour, bones, and the motion of every clip."""
+    _check_choices(settings, "fit")
     torch.set_num_threads(max(1, run.threads))
     collection = collect(frames, masks, flow, features, poses, settings.flow_steps, run)
     normal = initialise.normalise(collection.observations, collection.camera_from_object, collection.intrinsics)
@@ -155,6 +168,7 @@ def correct(
     run: Run,
 ) -> None:
     """The same model with its articulation corrected while the shape is held."""
+    _check_choices(settings, "correct")
     _continue(fit, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
 
 
@@ -171,6 +185,7 @@ def refine(
     run: Run,
 ) -> None:
     """The final model: sharper shape, corrected skinning."""
+    _check_choices(settings, "refine")
     _continue(correct, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
 
 
@@ -181,6 +196,8 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
         mlp_depth=settings.mlp_depth,
         mlp_width=settings.mlp_width,
         pose_code=settings.pose_code,
+        blending=settings.blending,
+        deformation=settings.deformation,
         octaves=initialise.octaves(collection.videos, settings.motion_period_s),
         splines=initialise.splines(collection.videos, settings.motion_spacing_s),
     )
@@ -213,6 +230,13 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
     )
     model.root_free.copy_(free)
     return model
+
+
+def _check_choices(settings: PhaseSettings, section: str) -> None:
+    for key, known in _CHOICES.items():
+        value = getattr(settings, key, known[0])
+        if value not in known:
+            raise BadInput(f"[{section}] {key} = {value!r} is none of {', '.join(known)}")
 
 
 def _continue(before: Folder, collection: Collection, settings: PhaseSettings, out: Path, run: Run) -> None:
@@ -253,7 +277,7 @@ def _run_phase(
     model = trainer.model
     if isinstance(settings, RefineSettings):
         _diagnose(trainer, collection, out, run)
-    if isinstance(settings, FitSettings) and settings.settle_root:
+    if isinstance(settings, FitSettings) and settings.settle_root and model.dense is None:
         run.metric("root_settled_deg", round(math.degrees(settle(model)), 3))
     _write_folder(model.to("cpu"), collection, history, out)
     for name, value in history[-1].items() if history else ():

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from stages.fitting.active import Uncertainty
 from stages.fitting.batches import Batch, Draws
-from stages.fitting.schedule import PhaseSettings
+from stages.fitting.schedule import PhaseSettings, flow_speaks_alone
 from stages.fitting.team import ALONE, Team
 from stages.geometry.cameras import pixel_directions, project, ray_box, transform
 from stages.geometry.rotations import so3_log
@@ -17,6 +17,8 @@ from stages.model import losses, rendering
 from stages.model.banmo import Banmo, FrameState
 from stages.model.correspondence import match_grid, soft_argmax
 from stages.model.fields import GridField
+
+_PICTURE_TERMS = ("silhouette", "rgb", "feature", "match", "cycle_2d")
 
 
 class Rendered(NamedTuple):
@@ -154,6 +156,8 @@ def evaluate(
     if settings.weight_cycle_3d:
         terms["cycle_3d"] = settings.weight_cycle_3d * _cycle_3d(model, state, seen, draws)
     terms.update(motion_terms(model, batch.frame_idx, settings))
+    if flow_speaks_alone(settings, step) and "flow" in terms:
+        terms = {name: value for name, value in terms.items() if name not in _PICTURE_TERMS}
     if team.size > 1:
         terms = {name: share * value for name, value in terms.items()}
     for name, value in _shape_terms(model, prepared, settings, step).items():

@@ -57,6 +57,8 @@ class PhaseSettings:
     """Steps over which the step sizes rise from zero."""
     decay_from: float = 0.3
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
+    rate: str = "linear"
+    """How step sizes move: linear (see decay_from), or one_cycle (up for 30 % of the phase, then down; the paper's)."""
     sdf_frozen_until: float = 0.0
     """Share of the phase during which the shape is held while the motion catches up."""
 
@@ -66,6 +68,10 @@ class PhaseSettings:
     """Silhouette (L_sil)."""
     weight_flow: float = 0.02
     """Optical flow in pixels (L_OF)."""
+    flow_only_every: int = 0
+    """Early on, every so many steps flow alone speaks for the pictures, so that motion leads; 0 = never."""
+    flow_only_until: float = 0.3
+    """Share of the phase that counts as early."""
     weight_feature: float = 0.05
     """Rendered embedding against the pixel's features."""
     weight_match: float = 0.0
@@ -111,8 +117,22 @@ def beta_at(settings: PhaseSettings, progress: float) -> float:
 
 
 def rate_at(settings: PhaseSettings, step: int) -> float:
-    """Factor on every step size at `step`: rises over the warm-up, constant, then linear down to a tenth."""
+    """Factor on every step size at `step`.
+
+    linear: rises over the warm-up, constant, then linear down to a tenth. one_cycle: along cosines from 1/25 up at 30 %
+    of the phase and down to 1/1000 at its end (Smith and Topin 2018).
+    """
     progress = step / max(1, settings.iterations)
+    if settings.rate == "one_cycle":
+        if progress < 0.3:
+            return 0.04 + 0.96 * (1 - math.cos(math.pi * progress / 0.3)) / 2
+        return 0.001 + 0.999 * (1 + math.cos(math.pi * min(1.0, (progress - 0.3) / 0.7))) / 2
     warm = min(1.0, (step + 1) / max(1, min(settings.warmup_steps, settings.iterations // 5 + 1)))
     fall = max(0.0, (progress - settings.decay_from) / max(1e-6, 1 - settings.decay_from))
     return warm * (1 - 0.9 * min(1.0, fall))
+
+
+def flow_speaks_alone(settings: PhaseSettings, step: int) -> bool:
+    """Whether `step` is one of the early ones at which flow alone speaks for the pictures."""
+    every = settings.flow_only_every
+    return every > 0 and step % every == every - 1 and step < settings.flow_only_until * settings.iterations

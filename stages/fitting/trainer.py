@@ -68,7 +68,7 @@ class Trainer:
             "sdf": (sdf, s.lr_sdf),
             "colour": (colour, s.lr_colour),
             "environment": (list(m.environment.parameters()), s.lr_motion if s.lr_colour else 0.0),
-            "motion": (list(m.body.parameters()), s.lr_motion),
+            "motion": ([*m.body.parameters(), *(m.dense.parameters() if m.dense else ())], s.lr_motion),
             "bones": (list(m.bones.parameters()), s.lr_bones),
             "root": (list(m.root.parameters()), s.lr_root),
             "focal": ([m.log_focal], s.lr_focal),

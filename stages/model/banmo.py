@@ -16,9 +16,17 @@ import torch
 from torch import Tensor, nn
 
 from stages.geometry.rotations import interpolate_rigid, invert_rigid
+from stages.model.dense import DenseWarp
 from stages.model.fields import GridField, MlpField
 from stages.model.motion import BodyPose, FourierCode, RootPose
-from stages.model.skeleton import Bones, DeltaSkinning, blend, score_coefficients, skinning_weights
+from stages.model.skeleton import (
+    Bones,
+    DeltaSkinning,
+    blend,
+    blend_rigidly,
+    score_coefficients,
+    skinning_weights,
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,8 @@ class Architecture:
     env_code: int = 16
     octaves: int = 5
     splines: int = 0
+    blending: str = "linear"
+    deformation: str = "skinning"
 
 
 class FrameState(NamedTuple):
@@ -101,6 +111,11 @@ class Banmo(nn.Module):
         self.environment = FourierCode(count, a.env_code, 2, generator)
         self.delta = DeltaSkinning(len(bones), a.pose_code)
         self.use_delta = False
+        self._blend = {"linear": blend, "dual_quaternion": blend_rigidly}[a.blending]
+        self.dense: nn.ModuleList | None = None
+        if a.deformation != "skinning":
+            turns = {"se3": True, "translation": False}[a.deformation]
+            self.dense = nn.ModuleList(DenseWarp(a.pose_code, turns, generator) for _ in range(2))
         self.log_focal = nn.Parameter(torch.zeros(count))
         self.register_buffer("base_poses", base_poses.clone().float())
         self.register_buffer("gauge", torch.eye(4).repeat(len(base_poses), 1, 1))  # see stages.fitting.gauge
@@ -172,15 +187,19 @@ class Banmo(nn.Module):
 
     def backward(self, state: FrameState, points: Tensor) -> Tensor:
         """W_backward: object space (F, N, 3) to canonical space (F, N, 3), equations 4 to 8."""
+        if self.dense is not None:
+            return self.dense[0](points, state.code)
         delta = self.delta(points, state.code) if self.use_delta else None
         weights = skinning_weights(points, state.posed_coefficients, delta)
-        return blend(points, weights, state.inverse)
+        return self._blend(points, weights, state.inverse)
 
     def forward_points(self, state: FrameState, points: Tensor) -> Tensor:
         """W_forward: canonical space (F, N, 3) to object space (F, N, 3), equations 4 to 8."""
+        if self.dense is not None:
+            return self.dense[1](points, state.code)
         rest = self.delta(points, torch.zeros_like(state.code)) if self.use_delta else None
         weights = skinning_weights(points, state.rest_coefficients.expand(len(points), -1, -1), rest)
-        return blend(points, weights, state.transforms)
+        return self._blend(points, weights, state.transforms)
 
     # ------------------------------------------------------------------------------------------ reading a model
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from stages.geometry.rotations import quaternion_to_matrix
+from stages.geometry.rotations import matrix_to_quaternion, quaternion_to_matrix
 
 
 class Bones(nn.Module):
@@ -114,6 +114,31 @@ def blend(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
     flat = transforms[..., :3, :].reshape(*transforms.shape[:-2], 12)
     matrices = (weights @ flat).reshape(*points.shape[:-1], 3, 4)
     return (matrices[..., :3] * points[..., None, :]).sum(-1) + matrices[..., 3]
+
+
+def dual_quaternions(transforms: Tensor) -> Tensor:
+    """Unit dual quaternions (..., B, 8) of rigid transforms (..., B, 4, 4): real part, then dual part.
+
+    Signs are those of the first bone's hemisphere, so that a blend takes the short way round (Kavan et al. 2008).
+    """
+    real = matrix_to_quaternion(transforms[..., :3, :3])
+    side = (real * real[..., :1, :]).sum(-1, keepdim=True)
+    real = torch.where(side < 0, -real, real)
+    shift = transforms[..., :3, 3]
+    w, v = real[..., :1], real[..., 1:]
+    # 0.5 (0, t) (w, v)
+    dual = 0.5 * torch.cat([-(shift * v).sum(-1, keepdim=True), w * shift + torch.linalg.cross(shift, v)], -1)
+    return torch.cat([real, dual], -1)
+
+
+def blend_rigidly(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
+    """Dual quaternion skinning of points (F, N, 3): rigid everywhere, so joints do not collapse where they twist."""
+    mixed = weights @ dual_quaternions(transforms)
+    mixed = mixed / mixed[..., :4].norm(dim=-1, keepdim=True).clamp_min(1e-8)
+    w, v = mixed[..., :1], mixed[..., 1:4]
+    dual_w, dual_v = mixed[..., 4:5], mixed[..., 5:]
+    turned = points + 2 * torch.linalg.cross(v, torch.linalg.cross(v, points) + w * points)
+    return turned + 2 * (w * dual_v - dual_w * v + torch.linalg.cross(v, dual_v))
 
 
 class DeltaSkinning(nn.Module):

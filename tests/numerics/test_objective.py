@@ -11,7 +11,7 @@ import torch
 
 from stages.fitting import objective
 from stages.fitting.batches import Batch, draw, step_generator
-from stages.fitting.schedule import beta_at, rate_at
+from stages.fitting.schedule import beta_at, flow_speaks_alone, rate_at
 from stages.fitting.surface import frame_boxes, surface_points
 from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import rigid, so3_exp
@@ -297,3 +297,24 @@ def test_sharpness_and_rates_along_a_phase() -> None:
     assert rates[0] == pytest.approx(0.5) and rates[1:60] == pytest.approx([1.0] * 59)
     assert rates[80] == pytest.approx(0.55) and rates[99] < 0.13
     assert all(b <= a + 1e-12 for a, b in pairwise(rates[2:]))
+
+
+def test_one_cycle_goes_up_and_down() -> None:
+    settings = tiny_settings(iterations=200, rate="one_cycle")
+    rates = [rate_at(settings, s) for s in range(200)]
+    peak = rates.index(max(rates))
+    assert abs(peak - 60) <= 1 and rates[peak] == pytest.approx(1.0, abs=1e-3)
+    assert rates[0] == pytest.approx(0.04) and rates[-1] < 0.002
+    assert all(a < b for a, b in pairwise(rates[: peak + 1])) and all(a > b for a, b in pairwise(rates[peak:]))
+
+
+def test_early_steps_at_which_flow_speaks_alone(seen: Scene) -> None:
+    settings = tiny_settings(iterations=20, flow_only_every=3, flow_only_until=0.5)
+    assert [s for s in range(20) if flow_speaks_alone(settings, s)] == [2, 5, 8]
+    model, boxes = ready(model_of(seen, ball))
+    batch = draw(seen.observations, 4, 24, step_generator(0, 0))
+    names = [
+        set(objective.evaluate(model, boxes, batch, settings, 0.02, step, step_generator(0, 0))) for step in (1, 2)
+    ]
+    assert names[0] - names[1] == {"silhouette", "rgb", "feature", "match", "cycle_2d"}
+    assert "flow" in names[1] and names[1] < names[0]

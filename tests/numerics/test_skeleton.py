@@ -15,7 +15,9 @@ from stages.model.skeleton import (
     Bones,
     DeltaSkinning,
     blend,
+    blend_rigidly,
     bone_tree,
+    dual_quaternions,
     monomials,
     score_coefficients,
     skinning_weights,
@@ -145,3 +147,41 @@ def test_bones_start_as_spheres_along_the_axes() -> None:
     assert torch.equal(bones.orientations, torch.eye(3).expand(2, 3, 3))
     assert {name for name, _ in bones.named_parameters()} == {"centres", "quaternions", "log_scales"}
     assert bones.parents.dtype == torch.int64
+
+
+def random_rigid(frames: int, bones: int, size: float, seed: int = 3) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    turns = so3_exp(size * torch.randn(frames, bones, 3, generator=generator, dtype=torch.float64))
+    return rigid(turns, torch.randn(frames, bones, 3, generator=generator, dtype=torch.float64))
+
+
+def test_dual_quaternions_of_one_bone_move_as_its_matrix() -> None:
+    transforms = random_rigid(3, 4, 2.0)
+    points = torch.randn(3, 40, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    for bone in range(4):
+        weights = torch.zeros(3, 40, 4, dtype=torch.float64)
+        weights[..., bone] = 1
+        assert torch.allclose(blend_rigidly(points, weights, transforms), blend(points, weights, transforms), atol=1e-9)
+    dual = dual_quaternions(transforms)
+    assert torch.allclose(dual[..., :4].norm(dim=-1), torch.ones(3, 4, dtype=torch.float64))
+    assert ((dual[..., :4] * dual[..., 4:]).sum(-1).abs() < 1e-12).all()
+    assert ((dual[..., :4] * dual[:, :1, :4]).sum(-1) >= 0).all()
+
+
+def test_dual_quaternion_blends_are_rigid_and_linear_ones_collapse() -> None:
+    """Half way of a half turn about x: a quarter turn, where the mean of the matrices squeezes y and z to nothing."""
+    turn = torch.tensor([[[0.0, 0, 0], [3.1, 0, 0]]], dtype=torch.float64)
+    transforms = rigid(so3_exp(turn), torch.zeros(1, 2, 3, dtype=torch.float64))
+    points = torch.tensor([[[0.3, 1.0, 0.0], [0.0, 0.0, 2.0]]], dtype=torch.float64)
+    half = torch.full((1, 2, 2), 0.5, dtype=torch.float64)
+    expected = points @ so3_exp(torch.tensor([1.55, 0, 0], dtype=torch.float64)).T
+    assert torch.allclose(blend_rigidly(points, half, transforms), expected, atol=1e-9)
+    assert float(blend(points, half, transforms)[0, 1].norm()) < 0.1
+
+
+def test_bones_that_agree_are_followed_whatever_their_weights() -> None:
+    one = random_rigid(2, 1, 1.0)
+    points = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    weights = torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64).softmax(-1)
+    found = blend_rigidly(points, weights, one.expand(-1, 3, -1, -1))
+    assert torch.allclose(found, blend(points, weights, one.expand(-1, 3, -1, -1)), atol=1e-9)

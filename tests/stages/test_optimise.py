@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline import Interrupted, Run
+from pipeline import BadInput, Interrupted, Run
 from stages import formats, optimise
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection
@@ -218,3 +218,11 @@ def test_refinement_tells_how_each_frame_fits(collection: Collection, tmp_path: 
         assert all(len(v) == FRAMES for v in figures.values())
         assert all(0.5 < v <= 1 for v in figures["overlap"])
         assert run.metrics[f"overlap_{name}"] > 0.5
+
+
+@pytest.mark.parametrize(("section", "key"), [("fit", "blending"), ("fit", "deformation"), ("refine", "rate")])
+def test_a_choice_that_is_none_is_said(section: str, key: str) -> None:
+    settings = {"fit": optimise.FitSettings, "refine": optimise.RefineSettings}[section](**{key: "magic"})
+    with pytest.raises(BadInput, match=rf"\[{section}\] {key} = 'magic' is none of "):
+        optimise._check_choices(settings, section)
+    optimise._check_choices(optimise.CorrectSettings(), "correct")
