@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,8 @@ from synthetic.bodies import quadruped, vary_quadruped
 from synthetic.canonical import Carrier, canonical_body
 from synthetic.flesh import Body
 from synthetic.people import person, vary_person
-from synthetic.postures import bone_transforms, person_posture, quadruped_posture
+from synthetic.postures import Posture, bone_transforms, person_posture, quadruped_posture
+from synthetic.things import place_labels, thing, thing_parts
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +48,14 @@ HUMAN_PARTS = (
     "face", "hair", "neck", "top", "top_front", "top_back", "pelvis", "sleeve", "forearm", "hand", "thigh", "shin",
     "shoe", "eye", "mouth", "brow",
 )  # fmt: skip
-PARTS = {"quadruped": QUADRUPED_PARTS, "human": HUMAN_PARTS}
+PARTS = {"quadruped": QUADRUPED_PARTS, "human": HUMAN_PARTS, "thing": tuple(f"piece_{k}" for k in range(8))}
+
+
+_POSTURES: dict[str, Callable[[np.random.Generator], Posture]] = {
+    "quadruped": quadruped_posture,
+    "human": person_posture,
+    "thing": lambda _: {},
+}
 
 
 @dataclass(frozen=True)
@@ -80,7 +89,7 @@ def view_rotation(azimuth: float, elevation: float, roll: float) -> np.ndarray:
 def random_view(rng: np.random.Generator, category: str) -> tuple[float, float, float]:
     """Azimuth (any), elevation and roll (as people hold cameras), radians."""
     if category == "human":
-        elevation = rng.normal(6, 9) if rng.random() < 0.85 else rng.uniform(-25, 50)
+        elevation = rng.normal(12, 12) if rng.random() < 0.85 else rng.uniform(-25, 65)
     else:
         elevation = rng.normal(16, 13) if rng.random() < 0.8 else rng.uniform(-15, 75)
     roll = rng.normal(0, 7) if rng.random() < 0.9 else rng.uniform(-35, 35)
@@ -89,25 +98,28 @@ def random_view(rng: np.random.Generator, category: str) -> tuple[float, float, 
 
 def random_body(rng: np.random.Generator, category: str) -> Body:
     """A body of the category with its proportions drawn anew."""
+    if category == "thing":
+        return thing(rng)
     return person(vary_person(rng), 72) if category == "human" else quadruped(vary_quadruped(rng), 84)
 
 
 def vertex_parts(body: Body, category: str, rng: np.random.Generator) -> np.ndarray:
     """(V,) uint8 part of every vertex; hair lines, collars and the like vary with `rng`."""
+    if category == "thing":
+        return thing_parts(body, rng)
     return _person_parts(body, rng) if category == "human" else _quadruped_parts(body, rng)
 
 
-def render_views(body: Body, category: str, carrier: Carrier, views: int, rng: np.random.Generator) -> Shard:
-    """Pictures of one body in `views` postures from `views` sides."""
+def render_views(body: Body, category: str, labels: np.ndarray, views: int, rng: np.random.Generator) -> Shard:
+    """Pictures of one body in `views` postures from `views` sides; `labels` (V,) canonical vertex of each vertex."""
     shape = (views, SIDE_PX, SIDE_PX)
     shard = Shard(
         np.full(shape, NOTHING, np.uint16), np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.int8),
         np.zeros((views, 3, 3), np.float32), np.zeros((views, 3), np.float32),
     )  # fmt: skip
-    labels, parts = carrier.labels(body), vertex_parts(body, category, rng)
+    parts = vertex_parts(body, category, rng)
     for k in range(views):
-        posture = person_posture(rng) if category == "human" else quadruped_posture(rng)
-        posed = body.skin(bone_transforms(body, posture))
+        posed = body.skin(bone_transforms(body, _POSTURES[category](rng)))
         posed = posed - (posed.min(0) + posed.max(0)) / 2
         azimuth, elevation, roll = random_view(rng, category)
         rotation = view_rotation(azimuth, elevation, roll)
@@ -232,7 +244,7 @@ def main(
 
     Args:
         out: Folder to write to; made if missing.
-        category: quadruped or human.
+        category: quadruped, human or thing.
         bodies: How many bodies.
         views: Pictures a body.
         seed: Another seed, another bank.
@@ -240,12 +252,13 @@ def main(
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     out.mkdir(parents=True, exist_ok=True)
-    carrier = Carrier.of(canonical_body(category))
+    label = place_labels if category == "thing" else Carrier.of(canonical_body(category)).labels
     begun = time.perf_counter()
     for k in range(first, first + bodies):
         rng = np.random.default_rng([seed, len(category), k])
         part = out / f".{category}-{k:04d}.part"
-        render_views(random_body(rng, category), category, carrier, views, rng).save(part)
+        body = random_body(rng, category)
+        render_views(body, category, label(body), views, rng).save(part)
         part.rename(out / f"{category}-{k:04d}.npz")
     spent = time.perf_counter() - begun
     log.info("%d pictures in %.0f s, %.0f a second", bodies * views, spent, bodies * views / spent)

@@ -5,6 +5,7 @@ Everything random comes from one torch generator, so that a seed gives the same 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -56,6 +57,7 @@ class Batch:
     label: Tensor  # (B, L, L) canonical vertex, -1 where there is none
     view: Tensor  # (B, 3) radians
     present: Tensor  # (B,) bool: the object is in the picture
+    shown: Tensor  # (B, 1, S, S) what a mask given as a prompt would cover: the object, or a thing in its place
 
 
 class Random:
@@ -78,13 +80,21 @@ class Random:
         return torch.randint(limit, shape, generator=self.generator)
 
 
-def dress(banks: list[Bank], backgrounds: Tensor, count: int, draw: Random, hard: float = 1.0) -> list[Batch]:
-    """`count` fresh pictures of each category. `backgrounds` (M, 3, S', S') uint8; `hard` in 0..1 scales the faults."""
+def dress(
+    banks: list[Bank], things: Bank, backgrounds: Tensor, count: int, draw: Random, hard: float = 1.0
+) -> list[Batch]:
+    """`count` fresh pictures of each category.
+
+    `things` stand about in the background, and now and then in the object's place. `backgrounds` (M, 3, S', S') uint8;
+    `hard` in 0..1 scales the faults.
+    """
     dressed = [_coloured(bank, count, draw) for bank in banks]
+    lumps = _coloured(things, (count + 1) // 2, draw)[0].repeat(2, 1, 1, 1)[:count]
     out = []
     for k, (bank, (rgba, vertex, view)) in enumerate(zip(banks, dressed, strict=True)):
-        other = dressed[(k + 1) % len(dressed)][0]
-        out.append(_pictured(bank, rgba, vertex, view, other, backgrounds, draw, hard))
+        foreign = draw.chance(count, 0.35)[:, None, None, None]
+        other = torch.where(foreign, dressed[(k + 1) % len(dressed)][0], lumps.roll(k, 0))
+        out.append(_pictured(bank, rgba, vertex, view, other, lumps, backgrounds, draw, hard))
     return out
 
 
@@ -97,7 +107,7 @@ def _coloured(bank: Bank, count: int, draw: Random) -> tuple[Tensor, Tensor, Ten
     vertex = bank.vertex[chosen].long()
     on = vertex < len(bank.rest)
     coat, noise = _coat(bank, count, draw)
-    colours, weight = _clothes(count, draw) if bank.category == "human" else _markings(count, draw)
+    colours, weight = _DRESS[bank.category](count, draw)
     flat = vertex.clamp_max(len(bank.rest) - 1).reshape(count, -1)
     part = bank.part[chosen].long().reshape(count, -1)
     of_coat = coat.gather(1, flat[..., None].expand(-1, -1, 3))
@@ -186,6 +196,15 @@ def _markings(count: int, draw: Random) -> tuple[Tensor, Tensor]:
     return colours, weight
 
 
+def _pieces(count: int, draw: Random) -> tuple[Tensor, Tensor]:
+    """Colours (B, parts, 3) of a thing's pieces and how much they cover its own pattern."""
+    pieces = len(PARTS["thing"])
+    plain = _cloth(count, draw)[:, None].expand(-1, pieces, -1)
+    mixed = torch.stack([_cloth(count, draw) for _ in range(pieces)], 1)
+    colours = torch.where(draw.chance(count, 0.5)[:, None, None], plain, mixed)
+    return colours, draw.chance(count, 0.6)[:, None] * draw.uniform(count, pieces, low=0.5)
+
+
 def _clothes(count: int, draw: Random) -> tuple[Tensor, Tensor]:
     """Colours (B, parts, 3) of a person's parts; clothes cover the body wholly."""
     names = PARTS["human"]
@@ -224,6 +243,12 @@ def _cloth(count: int, draw: Random) -> Tensor:
     return (grey + draw.normal(count, 3) * draw.uniform(count, 1, high=0.4)).clamp(0.02, 0.98)
 
 
+_DRESS: dict[str, Callable[[int, Random], tuple[Tensor, Tensor]]] = {
+    "quadruped": _markings,
+    "human": _clothes,
+    "thing": _pieces,
+}
+
 # --------------------------------------------------------------------------------------------- the picture
 
 
@@ -244,14 +269,15 @@ def _pictured(
     vertex: Tensor,
     view: Tensor,
     other: Tensor,
+    lumps: Tensor,
     backgrounds: Tensor,
     draw: Random,
     hard: float,
 ) -> Batch:
     count, side = len(rgba), INPUT_PX
     flip = 1.0 - 2.0 * draw.chance(count, 0.5).float()
-    wide = draw.chance(count, 0.25)
-    scale = torch.where(wide, draw.uniform(count, low=1.4, high=2.4), draw.uniform(count, low=0.98, high=1.45))
+    wide = draw.chance(count, 0.2)
+    scale = torch.where(wide, draw.uniform(count, low=1.4, high=2.2), draw.uniform(count, low=0.98, high=1.45))
     scale = torch.where(draw.chance(count, 0.08 * hard), draw.uniform(count, low=0.6, high=1.0), scale)
     room = (scale - 0.95).clamp_min(0.03)[:, None]
     shift = draw.uniform(count, 2, low=-1, high=1) * torch.where(wide[:, None], 0.8 * room, 0.6 * room)
@@ -259,7 +285,10 @@ def _pictured(
     shift = torch.where(cut, draw.uniform(count, 2, low=-0.75, high=0.75), shift)
     stretch = torch.exp(0.06 * draw.normal(count))
     grid = _grid(scale, shift, flip, side, stretch)
-    seen = functional.grid_sample(rgba, grid, align_corners=False)
+    present = ~draw.chance(count, 0.12)
+    instead = (~present & draw.chance(count, 0.75))[:, None, None, None]
+    seen = functional.grid_sample(torch.where(instead, lumps, rgba), grid, align_corners=False)
+    seen = seen * (present[:, None, None, None] | instead)
     coarse = _grid(scale, shift, flip, LABEL_PX, stretch)
     nothing = len(bank.rest)
     numbers = functional.grid_sample((vertex - nothing).float()[:, None], coarse, mode="nearest", align_corners=False)
@@ -268,25 +297,24 @@ def _pictured(
     label = torch.where(flip[:, None, None] < 0, swapped, label)
 
     back = _behind(backgrounds, count, draw)
-    stranger = draw.chance(count, 0.22 * hard)[:, None, None, None]
+    stranger = draw.chance(count, 0.45 * hard)[:, None, None, None]
     place = draw.uniform(count, 2, low=-1.6, high=1.6)
     another = functional.grid_sample(
         other, _grid(draw.uniform(count, low=1.0, high=2.6), place, flip, side), align_corners=False
     )
     another = another * stranger
     back = back * (1 - another[:, 3:]) + another[:, :3]
-    present = ~draw.chance(count, 0.06)
-    seen = seen * present[:, None, None, None]
     alpha = seen[:, 3:]
     back = back * _shadow(alpha, draw)
     image = back * (1 - alpha) + seen[:, :3]
     image, alpha = _occlude(image, alpha, backgrounds, draw, hard)
-    mask = (alpha > 0.5).float()
+    shown = (alpha > 0.5).float()
+    mask = shown * present[:, None, None, None]
     hidden = functional.interpolate(alpha, (LABEL_PX, LABEL_PX), mode="area")[:, 0] < 0.5
-    label = torch.where(hidden | (label >= nothing), -1, label)
+    label = torch.where(hidden | (label >= nothing) | ~present[:, None, None], -1, label)
     angles = torch.stack([view[:, 0] * flip, view[:, 1], view[:, 2] * flip], 1)
     visible = mask.mean((1, 2, 3)) > 0.015
-    return Batch(_camera(image, draw, hard), mask, label, angles, present & visible)
+    return Batch(_camera(image, draw, hard), mask, label, angles, present & visible, shown)
 
 
 def _behind(backgrounds: Tensor, count: int, draw: Random) -> Tensor:
@@ -296,7 +324,7 @@ def _behind(backgrounds: Tensor, count: int, draw: Random) -> Tensor:
     flip = 1.0 - 2.0 * draw.chance(count, 0.5).float()
     shift = (1 - scale)[:, None] * draw.uniform(count, 2, low=-1, high=1)
     image = functional.grid_sample(chosen, _grid(scale, shift, flip, INPUT_PX), align_corners=False)
-    return (image * draw.uniform(count, 3, 1, 1, low=0.75, high=1.25) * draw.uniform(count, 1, 1, 1, low=0.6)).clamp(
+    return (image * draw.uniform(count, 3, 1, 1, low=0.75, high=1.25) * draw.uniform(count, 1, 1, 1, low=0.7)).clamp(
         0, 1
     )
 
@@ -345,8 +373,8 @@ def _camera(image: Tensor, draw: Random, hard: float) -> Tensor:
     image = torch.where(
         where(0.18 * hard), functional.interpolate(small, (side, side), mode="bilinear", align_corners=False), image
     )
-    contrast = draw.uniform(count, 1, 1, 1, low=0.65, high=1.3)
-    image = (image - 0.45) * contrast + 0.45 + 0.1 * draw.normal(count, 1, 1, 1) * hard
+    contrast = draw.uniform(count, 1, 1, 1, low=0.75, high=1.3)
+    image = (image - 0.45) * contrast + 0.45 + 0.07 * draw.normal(count, 1, 1, 1) * hard
     image = image * (1 + 0.08 * draw.normal(count, 3, 1, 1))
     grey = image.mean(1, keepdim=True)
     image = torch.where(where(0.06), grey.expand_as(image), image)

@@ -99,12 +99,15 @@ def mask_loss(logits: Tensor, mask: Tensor) -> Tensor:
 
 
 def network_input(batch: Batch, draw: Random, prompted: Tensor) -> Tensor:
-    """(B, 4, S, S): the normalised picture, and for `prompted` (B,) pictures an imperfect mask, the rest taken off."""
+    """(B, 4, S, S): the normalised picture, and for `prompted` (B,) pictures an imperfect mask, the rest taken off.
+
+    A picture with nothing to show a mask of is not prompted.
+    """
     mean = torch.tensor(IMAGENET_MEAN)[None, :, None, None]
     std = torch.tensor(IMAGENET_STD)[None, :, None, None]
     image = (batch.image - mean) / std
-    mask = imperfect(batch.mask, draw)
-    given = prompted[:, None, None, None]
+    mask = imperfect(batch.shown, draw)
+    given = prompted[:, None, None, None] & (batch.shown.amax((1, 2, 3), keepdim=True) > 0)
     return torch.cat([torch.where(given, image * mask, image), mask * given], 1)
 
 

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from synthetic.backgrounds import backgrounds
 from synthetic.bank import Shard
 from synthetic.canonical import canonical_body, laplacian_basis, mirror_vertices
+from synthetic.things import PLACES, places
 from training.dressing import Bank, Random, dress
 from training.losses import Surface, mask_loss, network_input, view_blocks, view_loss
 from training.network import AZIMUTH_DEG, CATEGORIES, Network
@@ -33,11 +34,13 @@ LOG_EVERY, KEEP_EVERY_S = 100, 120.0
 
 
 def load_bank(folder: Path, category: str) -> Bank:
-    """All shards of a category in a folder."""
-    body = canonical_body(category)
+    """All shards of a category (or of `thing`) in a folder."""
     shards = [Shard.load(path) for path in sorted(folder.glob(f"{category}-*.npz"))]
     if not shards:
         raise FileNotFoundError(f"no renderings of {category} in {folder}; make some with python -m synthetic.bank")
+    if category == "thing":
+        return Bank.of(category, shards, torch.from_numpy(places()).float(), torch.arange(PLACES))
+    body = canonical_body(category)
     rest = torch.from_numpy(body.vertices).float()
     return Bank.of(category, shards, rest, torch.from_numpy(mirror_vertices(body.vertices)))
 
@@ -49,11 +52,18 @@ def make_surface(category: str, seed: int) -> Surface:
 
 
 def step_losses(
-    network: Network, surfaces: nn.ModuleList, banks: list[Bank], photos: Tensor, count: int, draw: Random, hard: float
+    network: Network,
+    surfaces: nn.ModuleList,
+    banks: list[Bank],
+    things: Bank,
+    photos: Tensor,
+    count: int,
+    draw: Random,
+    hard: float,
 ) -> tuple[Tensor, dict[str, float]]:
     """Dress a batch, run the network, add the losses up; also the figures worth a line in the log."""
-    batches = dress(banks, photos, count, draw, hard)
-    prompted = [draw.chance(count, 0.5) for _ in banks]
+    batches = dress(banks, things, photos, count, draw, hard)
+    prompted = [draw.chance(count, 0.55) for _ in banks]
     inputs = torch.cat([network_input(b, draw, p) for b, p in zip(batches, prompted, strict=True)])
     with torch.autocast(inputs.device.type, torch.bfloat16):
         out = network(inputs.contiguous(memory_format=torch.channels_last))
@@ -98,6 +108,7 @@ def _progress(logits: Tensor, mask: Tensor, batch: object) -> dict[str, float]:
 
 def train(
     banks: list[Bank],
+    things: Bank,
     photos: Tensor,
     out: Path,
     minutes: float,
@@ -132,7 +143,9 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (step + 1) / 200) * _fall(share)
             network.train()
-            loss, figures = step_losses(network, surfaces, banks, photos, batch, draw, min(1.0, 0.2 + share / 0.15))
+            loss, figures = step_losses(
+                network, surfaces, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
+            )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -192,7 +205,7 @@ def main(
 
     Args:
         out: Folder for the state and the log.
-        bank: Folder that `python -m synthetic.bank` filled, both categories.
+        bank: Folder that `python -m synthetic.bank` filled: quadrupeds, humans and things.
         minutes: How long.
         seed: Of everything random.
         batch: Pictures a step and category.
@@ -206,7 +219,16 @@ def main(
     torch.set_num_threads(threads)
     pictures = torch.from_numpy(backgrounds(np.random.default_rng(seed), photos)).permute(0, 3, 1, 2).contiguous()
     log.info("%d backgrounds", len(pictures))
-    train([load_bank(bank, name) for name in CATEGORIES], pictures, out, minutes, seed, batch, start=start)
+    train(
+        [load_bank(bank, name) for name in CATEGORIES],
+        load_bank(bank, "thing"),
+        pictures,
+        out,
+        minutes,
+        seed,
+        batch,
+        start=start,
+    )
 
 
 if __name__ == "__main__":
