@@ -20,33 +20,35 @@ class Surface:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, samples: int = 10_000, seed: int = _SEED) -> None:
         """Sample the mesh. Raises ValueError when it has no area."""
         self.vertices, self.faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-        self._generator = np.random.default_rng(seed)
-        self.points, _ = self._sample(samples)
+        generator = np.random.default_rng(seed)
+        self.points, _ = self._sample(samples, generator)
+        self._dense = self._sample(_DENSE, generator)
+        self._order = generator.permutation(samples)
 
-    def _sample(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def _sample(self, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Points (count, 3) and their faces (count,): one from each of `count` strips of equal area."""
         corner = self.vertices[self.faces]
         across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         filled = np.cumsum(np.linalg.norm(across, axis=1))
         if not len(filled) or not filled[-1] > 0:
             raise ValueError("the mesh has no area")
-        level = (np.arange(count) + self._generator.random(count)) / count * filled[-1]
+        level = (np.arange(count) + generator.random(count)) / count * filled[-1]
         face = np.minimum(np.searchsorted(filled, level), len(filled) - 1)
-        u, v = self._generator.random((2, count))
+        u, v = generator.random((2, count))
         root = np.sqrt(u)
         weight = np.stack([1 - root, root * (1 - v), root * v], axis=1)
         return np.einsum("nk,nkc->nc", weight, corner[face]), face
 
     @cached_property
     def _index(self) -> tuple[cKDTree, np.ndarray]:
-        points, face = self._sample(_DENSE)
+        points, face = self._dense
         centroids = self.vertices[self.faces].mean(axis=1)  # so that no face is too small to be found
         return cKDTree(np.concatenate([points, centroids])), np.concatenate([face, np.arange(len(self.faces))])
 
     @cached_property
     def shuffled(self) -> np.ndarray:
         """The samples in random order: any first part of them is spread over the whole surface."""
-        return self.points[np.random.default_rng(_SEED + 1).permutation(len(self.points))]
+        return self.points[self._order]
 
     @cached_property
     def few(self) -> cKDTree:
