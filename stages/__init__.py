@@ -31,6 +31,7 @@ EXPORTS = ("export", "report")
 
 VERBS = {
     "evaluate": "stages.verbs.evaluate",
+    "render": "stages.verbs.render",
     "retarget": "stages.verbs.retarget",
 }
 """Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""

@@ -243,7 +243,7 @@ def _curves(phases: list[tuple[str, Folder]]) -> dict[str, Any]:
                     series.setdefault(term, []).append([offset + float(row["step"]), float(row[term])])
         offset += float(rows[-1]["step"]) if rows else 0.0
     curves = [{"name": text, "points": series[term]} for term, text in _CURVES.items() if term in series]
-    return {"curves": curves, "phases": marks}
+    return {"curves": curves, "phases": marks, "steps": offset}
 
 
 def _root_poses(poses: Folder) -> list[dict[str, str]]:

@@ -79,12 +79,10 @@ class Player:
 
 
 def vertex_colour(glb: Glb, count: int) -> np.ndarray:
-    """sRGB colours (V, 3) in 0..1: of the attribute ``_COLOR``, else COLOR_0 (linear light), else grey."""
-    own = glb.attribute("_COLOR")
-    if own is not None and len(own) == count:
-        return np.clip(own[:, :3].astype(np.float64), 0, 1)
-    linear = glb.attribute("COLOR_0")
-    if linear is not None and len(linear) == count:
-        c = np.clip(linear[:, :3].astype(np.float64), 0, 1)
-        return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+    """sRGB colours (V, 3) in 0..1: of COLOR_1 where there is one (COLOR_0 is white then), of COLOR_0, else grey."""
+    for name in ("COLOR_1", "COLOR_0"):
+        linear = glb.attribute(name)
+        if linear is not None and len(linear) == count and linear.shape[1] >= 3:
+            c = np.clip(linear[:, :3].astype(np.float64), 0, 1)
+            return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 1e-12) ** (1 / 2.4) - 0.055)
     return np.full((count, 3), 0.7)

@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.animating.bvh import Bvh
 from stages.animating.glb import Animation, Glb, GlbError
+from stages.animating.playing import ROOT_MOTION
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class Motion:
     """A skeleton in motion, parents before children.
 
     rest: (B, 4, 4) and posed: (T, B, 4, 4), world_from_joint, y up. time_s: (T,) seconds from zero, increasing.
+    root: (T, 4, 4), the motion of the whole where the file keeps it apart, in a joint or node ``root_motion``.
     """
 
     names: list[str]
@@ -28,6 +30,7 @@ class Motion:
     rest: np.ndarray
     posed: np.ndarray
     time_s: np.ndarray
+    root: np.ndarray | None = None
 
     @property
     def height(self) -> float:
@@ -41,14 +44,21 @@ class NoPartners(ValueError):
 
 
 def motion_of_bvh(bvh: Bvh) -> Motion:
-    """A BVH file's motion."""
-    return Motion(bvh.names, bvh.parent, bvh.rest(), bvh.posed(), bvh.time_s)
+    """A BVH file's motion. A topmost joint ``root_motion`` carries the whole and is taken off."""
+    rest, posed = bvh.rest(), bvh.posed()
+    if bvh.names[0] != ROOT_MOTION or len(bvh.names) == 1:
+        return Motion(bvh.names, bvh.parent, rest, posed, bvh.time_s)
+    root = posed[:, 0] @ np.linalg.inv(rest[0])
+    parent = [max(-1, p - 1) for p in bvh.parent[1:]]
+    own = np.linalg.inv(posed[:, 0])[:, None] @ posed[:, 1:]
+    return Motion(bvh.names[1:], parent, np.linalg.inv(rest[0]) @ rest[1:], own, bvh.time_s, root)
 
 
 def motion_of_glb(glb: Glb, animation: Animation) -> Motion:
     """The motion of a GLB's skinned joints, in the frame of the node above the topmost joint.
 
-    So root motion that a file keeps in a node above its joints is left out.
+    So root motion that a file keeps in a node above its joints is left out; ours is kept as `root`. In our own files
+    the pose at rest is the one that the skin is bound in, whatever pose the file shows.
     """
     joints = glb.joints()
     order = [n for n in glb.order if n in set(joints)]
@@ -56,8 +66,12 @@ def motion_of_glb(glb: Glb, animation: Animation) -> Motion:
     parent = [_joint_above(glb, node, place) for node in order]
     times = animation.time_s
     moving = _chain(glb, glb.locals_at(animation, times), order, place)
-    still = _chain(glb, glb.locals_at(None, np.zeros(1)), order, place)
-    return Motion([glb.names[n] for n in order], parent, still[0], moving, times - times[0])
+    ours = glb.document.get("asset", {}).get("generator") == "banmo-pipeline"
+    still = skeleton_of(glb)[2] if ours else _chain(glb, glb.locals_at(None, np.zeros(1)), order, place)[0]
+    node = glb.names.index(ROOT_MOTION) if ROOT_MOTION in glb.names else -1
+    moved = any(track.node == node for track in animation.tracks)
+    root = glb.locals_at(animation, times)[:, node] if moved else None
+    return Motion([glb.names[n] for n in order], parent, still, moving, times - times[0], root)
 
 
 def _joint_above(glb: Glb, node: int, place: dict[int, int]) -> int:

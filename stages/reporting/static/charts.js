@@ -11,23 +11,28 @@ const BanmoCharts = (() => {
   const short = (v) => (v === 0 ? "0" : Math.abs(v) >= 100 ? v.toFixed(0) : Math.abs(v) >= 1 ? v.toFixed(1) : Math.abs(v) >= 0.01 ? v.toFixed(3) : v.toExponential(0));
 
   /* A curve over x; `logarithmic` on the y axis; `marks` are [x, text] of upright lines. */
-  function line(points, { width = 340, height = 120, logarithmic = false, low = null, high = null, marks = [], label = "" } = {}) {
+  function line(points, { width = 340, height = 120, logarithmic = false, low = null, high = null, start = null, end = null, percent = false, marks = [], label = "" } = {}) {
     const root = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label });
     const usable = points.filter((p) => Number.isFinite(p[1]) && (!logarithmic || p[1] > 0));
     if (!usable.length) { root.append(svg("text", { x: 8, y: 20 }, "no figures")); return { root, cursor() {} }; }
     const left = 40, right = width - 6, top = 8, bottom = height - 20, f = logarithmic ? Math.log : (v) => v;
     const xs = usable.map((p) => p[0]), ys = usable.map((p) => f(p[1]));
-    const x0 = Math.min(...xs), x1 = Math.max(...xs, x0 + 1e-9);
+    const x0 = start === null ? Math.min(...xs) : start, x1 = end === null ? Math.max(...xs, x0 + 1e-9) : end;
     let y0 = low === null ? Math.min(...ys) : f(low), y1 = high === null ? Math.max(...ys) : f(high);
     if (y1 - y0 < 1e-12) { y0 -= 0.5; y1 += 0.5; }
     const X = (x) => left + ((x - x0) / (x1 - x0)) * (right - left), Y = (v) => bottom - ((f(v) - y0) / (y1 - y0)) * (bottom - top);
     for (const t of [0, 0.5, 1]) {
       const v = y0 + t * (y1 - y0), y = bottom - t * (bottom - top);
-      root.append(svg("line", { x1: left, x2: right, y1: y, y2: y, class: "grid" }), svg("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, short(logarithmic ? Math.exp(v) : v)));
+      root.append(svg("line", { x1: left, x2: right, y1: y, y2: y, class: "grid" }), svg("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, percent ? `${Math.round(100 * v)} %` : short(logarithmic ? Math.exp(v) : v)));
     }
-    for (const [x, text] of marks) root.append(svg("line", { x1: X(x), x2: X(x), y1: top, y2: bottom, class: "grid" }), svg("text", { x: X(x) + 4, y: height - 6 }, text));
+    let written = -1e9;
+    for (const [x, text] of marks) {
+      if (x < x0 || x > x1) continue;
+      root.append(svg("line", { x1: X(x), x2: X(x), y1: top, y2: bottom, class: "grid" }));
+      if (X(x) - written > 7 * text.length + 10) { root.append(svg("text", { x: X(x) + 3, y: height - 6 }, text)); written = X(x) + 3 + 7 * text.length - 14; }
+    }
     const d = usable.map((p, i) => `${i ? "L" : "M"}${X(p[0]).toFixed(1)},${Y(p[1]).toFixed(1)}`).join("");
-    root.append(svg("path", { d: `${d}L${X(x1)},${bottom}L${X(x0)},${bottom}Z`, class: "fillc" }), svg("path", { d, class: "curve" }));
+    root.append(svg("path", { d: `${d}L${X(xs[xs.length - 1])},${bottom}L${X(xs[0])},${bottom}Z`, class: "fillc" }), svg("path", { d, class: "curve" }));
     const hand = svg("line", { y1: top, y2: bottom, x1: left, x2: left, class: "cursor", visibility: "hidden" });
     root.append(hand);
     return {

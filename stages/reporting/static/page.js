@@ -17,7 +17,7 @@
     legend.replaceChildren(); legend.hidden = viewer.look !== "seen";
     if (legend.hidden) return;
     const bar = make("div", "ramp"); bar.style.background = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map((t) => `rgb(${BanmoViewer.ramp(t).map((v) => Math.round(255 * v)).join(" ")})`).join(", ")})`;
-    const ends = make("div", "ends"); ends.append(make("span", "", "seen once"), make("span", "", `in ${Math.round(viewer.mostSeen)} frames`));
+    const ends = make("div", "ends"); ends.append(make("span", "", "seldom seen"), make("span", "", `in ${Math.round(100 * viewer.mostSeen)} % of the frames`));
     const never = make("div"), swatch = make("i", "swatch"); swatch.style.background = "rgb(219 56 71)"; never.append(swatch, "never seen: made up");
     legend.append(bar, ends, never);
   }
@@ -54,7 +54,7 @@
   for (const c of data.clips) {
     const card = make("article", "card clip-card"), head = make("div", "clip-head");
     head.append(make("h3", "", c.name), make("span", "", c.about)); card.append(head);
-    const chart = BanmoCharts.line(c.agreement, { width: 1000, height: 92, low: 0, high: 1, label: `agreement of outlines in ${c.name}` });
+    const chart = BanmoCharts.line(c.agreement, { width: 1000, height: 92, low: 0, high: 1, percent: true, label: `agreement of outlines in ${c.name}` });
     if (c.video) {
       const video = make("video"); video.src = c.video; video.muted = true; video.loop = true; video.playsInline = true; video.preload = "auto";
       const panels = make("div", "panels"); panels.append(make("span", "", "filmed"), make("span", "", "model over it"), make("span", "", "bones"));
@@ -81,7 +81,7 @@
   /* ---------------------------------------------------------------- curves */
   for (const c of data.curves) {
     const box = make("div", "chart"); box.append(make("h3", "", c.name));
-    box.append(BanmoCharts.line(c.points, { logarithmic: true, marks: data.phases, label: c.name }).root); $("loss-charts").append(box);
+    box.append(BanmoCharts.line(c.points, { logarithmic: true, start: 0, end: data.steps, marks: data.phases, label: c.name }).root); $("loss-charts").append(box);
   }
   if (!data.curves.length) $("curves").hidden = true;
 

@@ -56,7 +56,7 @@ const BanmoViewer = (() => {
       const box = new THREE.Box3().setFromBufferAttribute(mesh.geometry.attributes.position);
       const centre = box.getCenter(new THREE.Vector3()), size = box.getSize(new THREE.Vector3()).length();
       controls.target.copy(centre);
-      camera.position.copy(centre).add(new THREE.Vector3(0.62, 0.3, 0.86).normalize().multiplyScalar(size * 1.5));
+      camera.position.copy(centre).add(new THREE.Vector3(0.62, 0.3, 0.86).normalize().multiplyScalar(size * 1.22));
       controls.minDistance = size * 0.3; controls.maxDistance = size * 6; camera.near = size / 200; camera.far = size * 40;
       state.home = { position: camera.position.clone(), target: centre.clone() };
       sceneFloor(box, size);
@@ -101,14 +101,18 @@ const BanmoViewer = (() => {
       if (seen) {
         let most = 0; for (let v = 0; v < count; v++) most = Math.max(most, seen.getX(v));
         state.mostSeen = most;
-        state.attributes.seen = flat((v) => { const s = seen.getX(v); return s <= 0 ? [0.86, 0.22, 0.28] : ramp(Math.log1p(s) / Math.log1p(Math.max(most, 1))); });
+        state.attributes.seen = flat((v) => { const s = seen.getX(v); return s <= 0 ? [0.86, 0.22, 0.28] : ramp(Math.sqrt(s / Math.max(most, 1e-9))); });
       }
       const plain = () => new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.95, metalness: 0, side: THREE.DoubleSide });
       materials.skin = plain(); materials.seen = plain(); materials.normals = new THREE.MeshNormalMaterial({ side: THREE.DoubleSide });
     }
 
+    /* A soft shadow under the subject: a disc whose middle is dark, by vertex colours that fade into nothing. */
     function sceneFloor(box, size) {
-      ground = new THREE.Mesh(new THREE.CircleGeometry(size * 0.75, 64), new THREE.MeshBasicMaterial({ color: 0x000000, transparent: true, opacity: 0.06, depthWrite: false }));
+      const disc = new THREE.CircleGeometry(size * 0.5, 64), count = disc.attributes.position.count, fade = new Float32Array(4 * count);
+      for (let i = 0; i < count; i++) fade[4 * i + 3] = i === 0 ? 0.3 : 0;
+      disc.setAttribute("color", new THREE.BufferAttribute(fade, 4));
+      ground = new THREE.Mesh(disc, new THREE.MeshBasicMaterial({ vertexColors: true, transparent: true, depthWrite: false }));
       ground.rotation.x = -Math.PI / 2; ground.position.set(controls.target.x, box.min.y - 0.01 * size, controls.target.z); scene.add(ground);
     }
 
