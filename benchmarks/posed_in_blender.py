@@ -38,13 +38,15 @@ def main(glb: str, out: str, moments: str) -> None:
     for name in names:
         end = 0.0
         for mover in movers:
-            mover.animation_data.action = None
-            for track in mover.animation_data.nla_tracks:
-                track.mute, track.is_solo = track.name != name, False
-                if track.name == name:
-                    end = max(end, *(s.action_frame_end for s in track.strips))
-                    for strip in track.strips:
-                        strip.extrapolation = "HOLD"
+            data = mover.animation_data
+            data.action = None
+            for track in data.nla_tracks:
+                track.mute = True
+                for strip in track.strips if track.name == name else ():
+                    end = max(end, strip.action.frame_range[1])
+                    data.action = strip.action  # itself, not the strip: strips round their length to whole frames
+                    if hasattr(data, "action_slot"):
+                        data.action_slot = strip.action_slot
         facts["clips"][name] = end / FPS
         posed = []
         for frame in np.array(wanted[name]) * FPS:
