@@ -49,7 +49,7 @@ def draw(
         vertices_camera: (V, 3) before the camera (OpenCV); size: height, width in pixels.
         kind: one of :data:`KINDS`. Normals are in the camera's frame, x right, y up, z towards it, as (n + 1) / 2;
             depth is grey, near bright, over `depth_range`.
-        background: (3,) in 0..1 behind the object.
+        background: (3,) in 0..1 behind the object; silhouette and depth have black.
         supersample: rays a pixel along each side; depth and correspondence are never blended, so they take one.
     """
     factor = 1 if kind in ("depth", "correspondence") else supersample
@@ -58,7 +58,7 @@ def draw(
     fragments = rasterise(vertices_camera, surface.faces, k, height, width)
     pixels = fragments.pixels()
     picture = np.zeros((height * width, 4), np.float32)
-    picture[:, :3] = background
+    picture[:, :3] = 0.0 if kind in ("silhouette", "depth") else background  # so that they can be read as data
     if len(pixels):
         picture[pixels, :3] = _values(surface, vertices_camera, fragments, pixels, kind, depth_range)
         picture[pixels, 3] = 1.0
