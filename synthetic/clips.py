@@ -1,9 +1,11 @@
-"""Sample clips of one generated animal in a room, filmed from several sides, with exact ground truth.
+"""Sample clips of one generated animal or person in a room, filmed from several sides, with exact ground truth.
 
 ``python -m synthetic.clips OUT_DIR [--clips 3 --frames 40 --size 192 --seed 0 --truth]``
 
 Writes ``OUT_DIR/<kind>-00.mp4`` ... (H.264). With ``--truth`` also what lies beside a clip when you already know the
-answer: ``<clip>.masks.mp4`` (lossless) and ``<clip>.poses.json`` (root pose of every frame).
+answer: ``<clip>.masks.mp4`` (lossless) and ``<clip>.poses.json`` (root pose of every frame). With ``--motion`` also
+``OUT_DIR/truth/<clip>.npz``: ``faces``, ``vertices`` (T, V, 3), ``joints`` (T, B, 3), ``bones`` (T, B, 4, 4: rest to
+posed), ``bone_names``, ``parents``; object space.
 """
 
 from __future__ import annotations
@@ -21,11 +23,16 @@ import tyro
 
 from synthetic import motion
 from synthetic.bodies import KINDS, Body, quadruped, vary
+from synthetic.clothes import clothes
 from synthetic.coats import Coat, coat
+from synthetic.people import person, vary_person
+from synthetic.people_motion import perform_person
 from synthetic.rendering import Camera, Look, draw, flow_between, look_at
 from synthetic.rooms import make_room
 
 log = logging.getLogger(__name__)
+
+PERSON = "person"
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,13 @@ class Film:
     camera_from_object: np.ndarray  # (T, 4, 4) rigid root poses
     vertices: np.ndarray  # (T, V, 3) posed surface, object space
     body: Body
+    bones: np.ndarray  # (T, B, 4, 4) rest to posed, object space
+
+    @property
+    def joints(self) -> np.ndarray:
+        """(T, B, 3) where each bone's joint is, object space."""
+        rest = np.stack([np.append(bone.joint, 1.0) for bone in self.body.bones])
+        return np.einsum("tbij,bj->tbi", self.bones[:, :, :3], rest)
 
     def flow(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
         """Exact flow between two frames and where it is visible; see :func:`synthetic.rendering.flow_between`."""
@@ -60,8 +74,14 @@ class Film:
 
 
 def make_subject(seed: int, kind: str = "cat", pattern: str | None = None, palette: str | None = None) -> Subject:
-    """An individual of a kind (a key of ``bodies.KINDS``); see :func:`synthetic.coats.coat` for its dress."""
+    """An individual of a kind (a key of ``bodies.KINDS``, or ``person``).
+
+    `pattern` and `palette` dress an animal, see :func:`synthetic.coats.coat`.
+    """
     rng = np.random.default_rng([seed, 11])
+    if kind == PERSON:
+        grown = person(vary_person(rng, 0.03))
+        return Subject(kind, grown, clothes(grown, rng))
     body = quadruped(vary(KINDS[kind], rng, 0.04))
     return Subject(kind, body, coat(body, rng, pattern, palette))
 
@@ -70,7 +90,8 @@ def film(subject: Subject, clip: int, clips: int, frames: int, size: int, seed: 
     """Film one clip: its own room, light and performance; cameras of all clips together go round the animal."""
     rng = np.random.default_rng([seed, 23, clip])
     times = np.arange(frames) / fps
-    moving = motion.perform(subject.body, motion.improvise(rng, frames / fps), times)
+    perform = perform_person if subject.kind == PERSON else motion.perform
+    moving = perform(subject.body, motion.improvise(rng, frames / fps), times)
     room = make_room(rng)
     cameras = _orbit(rng, moving, 2 * np.pi * clip / clips, times, size)
     warm = rng.uniform(-0.05, 0.05)
@@ -88,7 +109,7 @@ def film(subject: Subject, clip: int, clips: int, frames: int, size: int, seed: 
         vertices.append(posed)
     return Film(
         f"{subject.kind}-{clip:02d}", fps, np.stack(images), np.stack(masks), cameras[0].intrinsics, np.stack(poses),
-        np.stack(vertices), subject.body,
+        np.stack(vertices), subject.body, moving.bones,
     )  # fmt: skip
 
 
@@ -148,6 +169,21 @@ def write_truth(folder: Path, made: Film) -> None:
     (folder / f"{made.name}.poses.json").write_text(json.dumps(poses) + "\n", encoding="utf-8")
 
 
+def write_motion(folder: Path, made: Film) -> None:
+    """Write the true surface, joints and bone transforms of every frame as an .npz; see the module's text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    bones = made.body.bones
+    np.savez_compressed(
+        folder / f"{made.name}.npz",
+        faces=made.body.faces.astype(np.int32),
+        vertices=made.vertices.astype(np.float32),
+        joints=made.joints.astype(np.float32),
+        bones=made.bones.astype(np.float32),
+        bone_names=np.array([b.name for b in bones]),
+        parents=np.array([b.parent for b in bones], np.int32),
+    )
+
+
 def write_clips(
     folder: Path,
     clips: int = 3,
@@ -156,10 +192,13 @@ def write_clips(
     seed: int = 0,
     truth: bool = False,
     kind: str = "cat",
+    with_motion: bool = False,
 ) -> list[Film]:
     """Film and write sample clips; returns them with their truth."""
     folder.mkdir(parents=True, exist_ok=True)
-    usual = {"pattern": "tabby", "palette": "ginger"} if seed == 0 else {}  # the sample everyone sees first
+    usual = (
+        {"pattern": "tabby", "palette": "ginger"} if seed == 0 and kind != PERSON else {}
+    )  # the sample everyone sees first
     subject = make_subject(seed, kind, **usual)
     films = []
     for clip in range(clips):
@@ -167,6 +206,8 @@ def write_clips(
         write_video(folder / f"{made.name}.mp4", made.images, made.fps)
         if truth:
             write_truth(folder, made)
+        if with_motion:
+            write_motion(folder / "truth", made)
         films.append(made)
         log.info("wrote %s (%d frames)", folder / f"{made.name}.mp4", frames)
     return films
@@ -180,8 +221,9 @@ def main(
     seed: int = 0,
     kind: str = "cat",
     truth: bool = False,
+    motion: bool = False,
 ) -> None:
-    """Write sample clips of a generated animal.
+    """Write sample clips of a generated animal or person.
 
     Args:
         out: Folder to write to; made if missing.
@@ -189,11 +231,12 @@ def main(
         frames: Frames a clip, at 20 a second.
         size: Side of the square picture in pixels, even.
         seed: Another seed, another animal.
-        kind: cat, dog or fox.
+        kind: cat, dog, fox, horse or person.
         truth: Also write true masks and root poses beside the clips.
+        motion: Also write true surfaces, joints and bones of every frame, into a folder `truth`.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    write_clips(out, clips, frames, size, seed, truth, kind)
+    write_clips(out, clips, frames, size, seed, truth, kind, motion)
 
 
 if __name__ == "__main__":

@@ -59,22 +59,22 @@ def improvise(rng: np.random.Generator, duration_s: float) -> Performance:
 def perform(body: Body, performance: Performance, times_s: np.ndarray) -> Motion:
     """Sample the motion at `times_s` (T,), any times from 0 on."""
     fine = np.arange(0.0, float(np.max(times_s)) + 0.02, 0.01)
-    walk = _smooth(np.interp(fine, performance.times_s, performance.walk), 25)
-    heading = _smooth(np.interp(fine, performance.times_s, performance.turn), 35)
+    walk = smooth_in_time(np.interp(fine, performance.times_s, performance.walk), 25)
+    heading = smooth_in_time(np.interp(fine, performance.times_s, performance.turn), 35)
     phase = np.cumsum(walk) * 0.01 / performance.stride_s
     leg = float(body.bones[body.index("thigh_left")].joint[1] - body.ground)
     stride = performance.stride * 2 * leg
     speed = np.gradient(phase, 0.01) * stride / DUTY * np.clip(walk, 0, 1)
     east = np.cumsum(speed * np.sin(heading)) * 0.01
     north = np.cumsum(speed * np.cos(heading)) * 0.01
-    yaw = _smooth(np.interp(fine, performance.times_s, performance.look_yaw), 31)
-    pitch = _smooth(np.interp(fine, performance.times_s, performance.look_pitch), 31)
+    yaw = smooth_in_time(np.interp(fine, performance.times_s, performance.look_yaw), 31)
+    pitch = smooth_in_time(np.interp(fine, performance.times_s, performance.look_pitch), 31)
 
     bones, places = [], []
     for t in np.asarray(times_s, float):
         now = [float(np.interp(t, fine, v)) for v in (walk, phase, yaw, pitch, heading, east, north)]
         bones.append(_pose(body, now[0], now[1], now[2], now[3], float(t), stride, performance.energy))
-        places.append(_place(now[4], now[5], now[6], -body.ground))
+        places.append(place_in_room(now[4], now[5], now[6], -body.ground))
     return Motion(np.stack(bones), np.stack(places))
 
 
@@ -188,7 +188,8 @@ def _shift(up: float) -> np.ndarray:
     return matrix
 
 
-def _place(heading: float, east: float, north: float, height: float) -> np.ndarray:
+def place_in_room(heading: float, east: float, north: float, height: float) -> np.ndarray:
+    """room_from_object (4, 4): turned by `heading` (radians) about y, moved to (east, height, north)."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec([0, heading, 0]).as_matrix()
     matrix[:3, 3] = (east, height, north)
@@ -206,7 +207,8 @@ def _wander(rng: np.random.Generator, count: int, size: float) -> np.ndarray:
     return size * np.tanh(np.convolve(raw, [0.25, 0.5, 0.75, 0.5, 0.25], "valid")[:count])
 
 
-def _smooth(values: np.ndarray, width: int) -> np.ndarray:
+def smooth_in_time(values: np.ndarray, width: int) -> np.ndarray:
+    """Weighted mean of (N,) values with their neighbours; `width` (odd) samples in all, constant beyond the ends."""
     kernel = np.hanning(width + 2)[1:-1]
     padded = np.pad(values, width // 2, mode="edge")
     return np.convolve(padded, kernel / kernel.sum(), "valid")[: len(values)]
