@@ -75,7 +75,7 @@ class Player:
         nodes = self.glb.joints()
         place = {node: i for i, node in enumerate(nodes)}
         parent = np.array([place.get(int(self.glb.parent[n]), -1) for n in nodes])
-        return scene[:, nodes, :3, 3], parent
+        return scene[:, nodes][..., :3, 3], parent
 
 
 def vertex_colour(glb: Glb, count: int) -> np.ndarray:
