@@ -1,0 +1,159 @@
+"""Views, prior masks and categories: what is done with a network's answers, with networks made up for the purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.perception.category import OTHER, choose_category
+from stages.perception.prior import Candidate, best_chain, object_boxes, object_prior, overlap, paste, windows
+from stages.perception.viewpoint import (
+    AZIMUTH_DEG,
+    ELEVATION_DEG,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    INPUT_PX,
+    ROLL_DEG,
+    angle_log_probabilities,
+    mask_box,
+    view_rotations,
+    viewpoint_log_probabilities,
+)
+from stages.registration.placing import view_angles
+
+BINS = (len(AZIMUTH_DEG), len(ELEVATION_DEG), len(ROLL_DEG))
+
+
+class RedFinder:
+    """Calls every red pixel the object; sees its centre right of the picture's as azimuth to the right."""
+
+    def __init__(self, category: int = 0) -> None:
+        self.category = category
+
+    def __call__(self, inputs: np.ndarray) -> dict[str, np.ndarray]:
+        image = inputs[:, :3] * IMAGENET_STD[:, None, None] + IMAGENET_MEAN[:, None, None]
+        red = (image[:, 0] > 0.6) & (image[:, 1] < 0.3)
+        prompted = inputs[:, 3].any(axis=(1, 2))
+        view = np.zeros((len(inputs), sum(BINS)), np.float32)
+        for k, mask in enumerate(inputs[:, 3]):
+            if mask.any():
+                right = np.nonzero(mask)[1].mean() > INPUT_PX / 2
+                view[k, int(np.argmin(np.abs(AZIMUTH_DEG - (65 if right else -65))))] = 9.0
+                view[k, BINS[0] + 3] = 9.0
+                view[k, BINS[0] + BINS[1] + (7 if right else 4)] = 9.0
+        dense = np.zeros((len(inputs), 17, INPUT_PX // 2, INPUT_PX // 2), np.float32)
+        dense[:, 0] = np.where(red[:, ::2, ::2], 6.0, -6.0)
+        kind = np.zeros((len(inputs), 3), np.float32)
+        kind[:, 2] = 5.0
+        kind[prompted & red.any(axis=(1, 2)), self.category] = 12.0
+        return {"view": view, "dense": dense, "category": kind}
+
+
+def moving_square(count: int = 9, height: int = 90, width: int = 160) -> tuple[np.ndarray, np.ndarray]:
+    """Green pictures with a red block that walks to the right, and its masks."""
+    frames = np.zeros((count, height, width, 3), np.uint8)
+    frames[..., 1] = 120
+    masks = np.zeros((count, height, width), np.uint8)
+    for i in range(count):
+        x = 20 + 8 * i
+        frames[i, 30:60, x : x + 40] = (230, 20, 20)
+        masks[i, 30:60, x : x + 40] = 255
+    return frames, masks
+
+
+def test_bins_are_the_rotations_they_say() -> None:
+    rotations = view_rotations()
+    assert rotations.shape == (np.prod(BINS), 3, 3)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), rotations.shape), atol=1e-9
+    )
+    a, e, r = 20, 4, 9
+    one = rotations[(a * BINS[1] + e) * BINS[2] + r]
+    bearing, elevation, roll = (float(np.rad2deg(v[0])) for v in view_angles(one[None]))
+    assert (-bearing, elevation, roll) == pytest.approx((AZIMUTH_DEG[a], ELEVATION_DEG[e], ROLL_DEG[r]), abs=1e-6)
+    facing = view_rotations()[(18 * BINS[1] + 2) * BINS[2] + 5]  # azimuth 5, elevation -5
+    assert (facing @ [0, 0, 1])[2] < -0.9 and (facing @ [0, 1, 0])[1] < -0.9, "looks at the camera, stands upright"
+    sideways = view_rotations()[(26 * BINS[1] + 2) * BINS[2] + 5]  # azimuth 85
+    assert (sideways @ [0, 0, 1])[0] > 0.9, "looks to the picture's right"
+
+
+def test_log_probabilities_follow_the_network_and_its_mirror_image() -> None:
+    frames, masks = moving_square(3)
+    masks[0, 30:60, 25:45] = 0  # lopsided: more of it on the right
+    masks[1, 30:60, 45:66] = 0
+    masks[2] = 0
+    found = viewpoint_log_probabilities(frames, masks, RedFinder())
+    np.testing.assert_allclose(np.exp(found).sum(1), 1, atol=1e-4)
+    assert np.ptp(found[2]) < 1e-9, "no mask, no opinion"
+    azimuth, elevation, roll = angle_log_probabilities(frames, masks, RedFinder())
+    joint = azimuth[0][:, None, None] + elevation[0][None, :, None] + roll[0][None, None, :]
+    np.testing.assert_allclose(joint.ravel(), found[0], atol=1e-4)
+    assert ELEVATION_DEG[elevation[0].argmax()] == 5.0
+
+    def answer(inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """Azimuth +65 and roll +11 whichever way the picture lies: its mirror image says the opposite."""
+        view = np.zeros((len(inputs), sum(BINS)), np.float32)
+        view[:, 24], view[:, BINS[0] + BINS[1] + 7] = 8.0, 8.0
+        return {"view": view, "dense": np.zeros((len(inputs), 17, 48, 48)), "category": np.zeros((len(inputs), 3))}
+
+    azimuth, _, roll = angle_log_probabilities(frames, masks, answer)
+    assert azimuth[0][24] == pytest.approx(azimuth[0][11]) and roll[0][7] == pytest.approx(roll[0][4])
+
+
+def test_box_leaves_specks_out() -> None:
+    mask = np.zeros((200, 300), np.uint8)
+    mask[50:150, 100:200] = 255
+    mask[3, 3] = 255
+    np.testing.assert_allclose(mask_box(mask), [100, 50, 200, 150], atol=1)
+    assert not mask_box(np.zeros((20, 20), np.uint8)).any()
+
+
+def test_windows_cover_the_picture() -> None:
+    for height, width in ((90, 160), (160, 90), (128, 128)):
+        seen = np.zeros((height, width), int)
+        for x0, y0, x1, y1 in windows(height, width):
+            assert x1 - x0 == pytest.approx(y1 - y0)
+            seen[max(0, round(y0)) : round(y1), max(0, round(x0)) : round(x1)] += 1
+        assert seen.min() >= 2
+
+
+def test_chain_prefers_what_stays() -> None:
+    def at(x: float, score: float) -> Candidate:
+        return Candidate(np.array([x, 0.0, x + 10, 10]), score)
+
+    found = [[at(0, 0.6), at(50, 0.7)], [at(1, 0.6), at(90, 0.8)], [], [at(2, 0.6), at(20, 0.8)]]
+    chain = best_chain(found)
+    assert [None if c is None else c.box[0] for c in chain] == [0.0, 1.0, None, 2.0]
+    assert best_chain([[], []]) == [None, None]
+    assert overlap(np.array([0, 0, 2, 2.0]), np.array([1, 0, 3, 2.0])) == pytest.approx(1 / 3)
+
+
+def test_prior_finds_what_the_network_sees() -> None:
+    frames, masks = moving_square()
+    prior = object_prior(frames, RedFinder())
+    assert prior.dtype == np.uint8 and prior.shape == masks.shape
+    both = ((prior > 127) & (masks > 0)).sum((1, 2)) / ((prior > 127) | (masks > 0)).sum((1, 2))
+    assert both.min() > 0.85
+    boxes = object_boxes(frames, RedFinder())
+    assert boxes is not None
+    np.testing.assert_allclose(boxes[4], [52, 30, 92, 60], atol=4)
+    nothing = np.zeros_like(frames)
+    assert object_boxes(nothing, RedFinder()) is None and not object_prior(nothing, RedFinder()).any()
+
+
+def test_paste_puts_a_crop_back() -> None:
+    whole = paste(np.ones((48, 48), np.float32), np.array([10.0, 20.0, 58.0, 68.0]), 100, 90)
+    assert whole[25:63, 15:53].min() == 1 and whole[:18].max() == 0 and whole[:, 62:].max() == 0
+    assert whole.sum() == pytest.approx(48 * 48, rel=0.05)
+
+
+def test_category_needs_a_word_and_a_mask() -> None:
+    frames, masks = moving_square()
+    networks = {"quadruped": RedFinder(0), "human": RedFinder(0)}
+    verdict = choose_category(frames, masks, networks)
+    assert verdict.category == "quadruped" and verdict.margin > 0.5
+    assert verdict.explained["quadruped"] > 0.7 and verdict.named["quadruped"] > 0.9 > 0.1 > verdict.named["human"]
+    elsewhere = np.roll(masks, 40, axis=1)  # the mask shows another thing than the networks find
+    assert choose_category(frames, elsewhere, networks).category == OTHER
+    assert choose_category(frames, masks, {"quadruped": RedFinder(2), "human": RedFinder(2)}).category == OTHER
+    assert choose_category(frames, np.zeros_like(masks), networks).category == OTHER
