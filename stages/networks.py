@@ -1,24 +1,13 @@
 """Networks of the user's own, as ONNX files: opened safely, run on the providers the machine has, shapes checked.
 
-A contract, a small TOML file named in the settings, says what a network expects; every key has a sane default::
-
-    size = [320, 320]          # height, width, where the file leaves them open
-    colour = "rgb"             # or "bgr"
-    scale = "unit"             # pixel values: "unit" 0..1, "byte" 0..255, "own-max" divided by the picture's largest
-    mean = [0.485, 0.456, 0.406]
-    std = [0.229, 0.224, 0.225]
-    output = 0                 # index or name of the output that counts
-    activation = "auto"        # of a mask: "none", "sigmoid", "minmax", "auto" (sigmoid where values leave 0..1)
-
-Defaults: masks and features take ImageNet's mean and std on 0..1; flow takes RGB 0..255 as it is, and its last output
-(the contract of the OpenCV zoo's RAFT). Weights kept outside the file are refused, and so are operators that
-onnxruntime does not know.
+What a network expects is said by a contract (:mod:`stages.contracts`). Masks and features take ImageNet's mean and
+std on 0..1 by default; flow takes RGB 0..255 as it is, and its last output (the OpenCV zoo's RAFT). Weights kept
+outside the file are refused, and so are operators that onnxruntime does not know and tensors too large to hold.
 """
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,84 +16,54 @@ import numpy as np
 import onnxruntime
 
 from pipeline import BadInput, InputFile
-from stages.onnx_safety import external_data
+from stages import contracts
+from stages.contracts import Contract, locate, read_contract
+from stages.onnx_safety import HUGE, inspect
 
 NO_FILE = InputFile("")
 MAX_BYTES = 2_000_000_000
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
-CHOICES = {
-    "colour": ("rgb", "bgr"),
-    "scale": ("unit", "byte", "own-max"),
-    "activation": ("auto", "none", "sigmoid", "minmax"),
-}
-
-
-@dataclass(frozen=True)
-class Contract:
-    """What a network expects and gives; see the module's text."""
-
-    size: tuple[int, int] | None = None
-    colour: str = "rgb"
-    scale: str = "unit"
-    mean: tuple[float, ...] = IMAGENET_MEAN
-    std: tuple[float, ...] = IMAGENET_STD
-    output: int | str = 0
-    activation: str = "auto"
-
-
-FLOW_CONTRACT = Contract(scale="byte", mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0), output=-1)
-
-
-def read_contract(path: str | Path, default: Contract) -> Contract:
-    """A contract file over the defaults; an empty path gives the defaults. Unknown keys and values are refused."""
-    if not str(path):
-        return default
-    name = Path(path).name
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{name} cannot be read as TOML ({error})") from error
-    known = set(Contract.__dataclass_fields__)
-    if set(table) - known:
-        raise BadInput(f"{name}: unknown key {min(set(table) - known)!r}; known: {', '.join(sorted(known))}")
-    for key, allowed in CHOICES.items():
-        if key in table and table[key] not in allowed:
-            raise BadInput(f"{name}: {key} is {table[key]!r}, it must be one of {', '.join(allowed)}")
-    for key, count in (("mean", 3), ("std", 3), ("size", 2)):
-        if key in table:
-            table[key] = _numbers(table[key], count, f"{name}: {key}")
-    if "size" in table:
-        table["size"] = (int(table["size"][0]), int(table["size"][1]))
-        if min(table["size"]) < 16 or max(table["size"]) > 4096:
-            raise BadInput(f"{name}: size must lie between 16 and 4096")
-    if any(s <= 0 for s in table.get("std", ())):
-        raise BadInput(f"{name}: std must be positive")
-    if isinstance(table.get("output", 0), bool) or not isinstance(table.get("output", 0), int | str):
-        raise BadInput(f"{name}: output is the index or the name of an output")
-    return replace(default, **table)
-
-
-def _numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
-    if not isinstance(value, list) or len(value) != count or not all(isinstance(v, int | float) for v in value):
-        raise BadInput(f"{what} must be a list of {count} numbers")
-    return tuple(float(v) for v in value)
+BOX_CORNERS = (2.0, 3.0)
+"""Labels of a box's corners among the clicks of a prompted network; 1 is a click on the object, 0 one beside it."""
 
 
 class Network:
     """An open ONNX session with its contract."""
 
-    def __init__(self, path: Path, contract: Contract, *, inputs: int, device: str = "cpu", threads: int = 1) -> None:
-        self.path, self.contract = path, contract
+    KIND, INPUTS, PICTURES = "picture", 1, 1
+
+    def __init__(
+        self,
+        network: str | Path,
+        contract: str | Path = "",
+        *,
+        default: Contract = contracts.PICTURE,
+        device: str = "cpu",
+        threads: int = 1,
+    ) -> None:
+        """Open a file, or a folder with an ONNX file and its contract. Raises BadInput when it cannot be trusted."""
+        path, beside = locate(network, contract)
+        self.path, self.contract = path, read_contract(beside, default)
+        if self.contract.kind != self.KIND:
+            raise BadInput(f"{path.name} is a network of kind {self.contract.kind!r}, {self.KIND!r} expected here")
         self.session = _session(path, device, threads)
         self.providers: list[str] = self.session.get_providers()
         found = self.session.get_inputs()
-        if len(found) != inputs:
-            raise BadInput(f"{path.name} takes {len(found)} inputs, {inputs} expected")
+        if len(found) != self.INPUTS:
+            raise BadInput(f"{path.name} takes {len(found)} inputs, {self.INPUTS} expected")
         self.names = [i.name for i in found]
         self.dtype = _dtype(found[0].type, path)
-        self.size = self._input_size(found)
+        self.size = self._input_size(found[: self.PICTURES])
         self.output = self._output_name()
+
+    @property
+    def name(self) -> str:
+        """What to call it: its file, or its folder where it was added under a name."""
+        return self.path.parent.name if self.path.name == "network.onnx" else self.path.name
+
+    @property
+    def on(self) -> str:
+        """The execution provider that runs it, in a word: cuda, cpu."""
+        return self.providers[0].removesuffix("ExecutionProvider").lower()
 
     def _input_size(self, found: list[Any]) -> tuple[int, int] | None:
         """(height, width) that the file fixes, else the contract's, else None (any size)."""
@@ -147,23 +106,24 @@ class Network:
 
     def run(self, *tensors: np.ndarray) -> np.ndarray:
         """The output that counts, float32; not finite or failing is the model file's fault (`BadInput`)."""
+        return self.run_outputs([self.output], *tensors)[0]
+
+    def run_outputs(self, outputs: Sequence[str], *tensors: np.ndarray) -> list[np.ndarray]:
+        """Named outputs as float32, for one tensor an input; raises as `run` does."""
         try:
-            result = self.session.run([self.output], dict(zip(self.names, tensors, strict=True)))[0]
+            found = self.session.run(list(outputs), dict(zip(self.names, tensors, strict=True)))
         except Exception as error:  # onnxruntime raises a family of untyped errors
             raise BadInput(
                 f"{self.path.name} fails on a picture of {tensors[0].shape}", hint=_first_line(error)
             ) from error
-        result = np.asarray(result, np.float32)
-        if not np.isfinite(result).all():
+        results = [np.asarray(value, np.float32) for value in found]
+        if not all(np.isfinite(value).all() for value in results):
             raise BadInput(f"{self.path.name} gives values that are not finite")
-        return result
+        return results
 
 
 class MaskNetwork(Network):
-    """1x3xHxW -> 1x1xHxW: how probably each pixel is the object."""
-
-    def __init__(self, path: Path, contract: str | Path = "", *, device: str = "cpu", threads: int = 1) -> None:
-        super().__init__(path, read_contract(contract, Contract()), inputs=1, device=device, threads=threads)
+    """1x3xHxW -> 1x1xHxW: how probably each pixel is the object (u2net, isnet, birefnet and their like)."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """(H, W) float32 in 0..1 of an (H, W, 3) uint8 RGB image."""
@@ -177,11 +137,72 @@ class MaskNetwork(Network):
         return cv2.resize(values, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
+class PromptedMaskNetwork(Network):
+    """A picture 1x3xHxW, clicks 1x1xNx2 and their labels 1x1xN (or 1x1xNx1) -> masks 1x1xKxHxW and K scores.
+
+    The OpenCV zoo's EfficientSAM as it is. Clicks are in pixels of the picture at the network's size; label 1 is a
+    click on the object, 0 one beside it, 2 and 3 the corners of a box, -1 fills up. The mask that scores best counts.
+    """
+
+    KIND, INPUTS = "prompted", 3
+
+    def __call__(
+        self,
+        image: np.ndarray,
+        box: np.ndarray | None = None,
+        inside: np.ndarray | None = None,
+        outside: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """(H, W) float32 in 0..1 of an (H, W, 3) uint8 RGB image; box (4,) and clicks (N, 2) in its pixels."""
+        size = self.size or _multiple_of(image.shape[:2], 32)
+        clicks, labels = self._prompts(box, inside, outside)
+        clicks = clicks * np.float32([size[1] / image.shape[1], size[0] / image.shape[0]])
+        shape = self.session.get_inputs()[2].shape
+        given = labels.reshape((1, 1, -1, 1) if len(shape) == 4 else (1, 1, -1))
+        outputs = [o.name for o in self.session.get_outputs()]
+        tensors = self.prepare(image, size), clicks[None, None].astype(self.dtype), given.astype(self.dtype)
+        found = self.run_outputs(outputs, *tensors)
+        masks = next((v for v in found if v.ndim == 5), None)
+        scores = next((v for v in found if v.ndim == 3), None)
+        if masks is None or scores is None or masks.shape[:2] != (1, 1) or scores.shape != masks.shape[:3]:
+            shapes = " and ".join(str(v.shape) for v in found)
+            raise BadInput(f"{self.path.name} gives {shapes}, masks of 1x1xKxHxW and scores of 1x1xK expected")
+        values = _activate(masks[0, 0, int(scores[0, 0].argmax())], self.contract.activation)
+        return cv2.resize(values, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+
+    def _prompts(
+        self, box: np.ndarray | None, inside: np.ndarray | None, outside: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Clicks (N, 2) and labels (N,), filled up or cut to as many as the network takes."""
+        clicks = [np.zeros((0, 2), np.float32)]
+        labels: list[float] = []
+        if box is not None:
+            clicks.append(np.float32(box).reshape(2, 2))
+            labels += BOX_CORNERS
+        for points, label in ((inside, 1.0), (outside, 0.0)):
+            if points is not None and len(points):
+                clicks.append(np.float32(points).reshape(-1, 2))
+                labels += [label] * len(points)
+        if not labels:
+            raise BadInput(f"{self.path.name} wants a box or a click, and there is none")
+        places, kinds = np.concatenate(clicks), np.float32(labels)
+        room = self.session.get_inputs()[1].shape[2]
+        if isinstance(room, int):
+            spare = max(0, room - len(kinds))
+            places = np.concatenate([places[:room], np.zeros((spare, 2), np.float32)])
+            kinds = np.concatenate([kinds[:room], np.full(spare, -1, np.float32)])
+        return places, kinds
+
+
 class FlowNetwork(Network):
     """Two pictures 1x3xHxW -> 1x2xHxW flow from the first to the second, in pixels of that size."""
 
-    def __init__(self, path: Path, contract: str | Path = "", *, device: str = "cpu", threads: int = 1) -> None:
-        super().__init__(path, read_contract(contract, FLOW_CONTRACT), inputs=2, device=device, threads=threads)
+    INPUTS = PICTURES = 2
+
+    def __init__(
+        self, network: str | Path, contract: str | Path = "", *, device: str = "cpu", threads: int = 1
+    ) -> None:
+        super().__init__(network, contract, default=contracts.FLOW, device=device, threads=threads)
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """(H, W, 2) float32 pixels of the pictures given, (H, W, 3) uint8 RGB."""
@@ -196,10 +217,7 @@ class FlowNetwork(Network):
 
 
 class FeatureNetwork(Network):
-    """1x3xHxW crop -> 1x16xhxw embedding, or 1x17xhxw with a mask logit first."""
-
-    def __init__(self, path: Path, contract: str | Path = "", *, device: str = "cpu", threads: int = 1) -> None:
-        super().__init__(path, read_contract(contract, Contract()), inputs=1, device=device, threads=threads)
+    """1x3xHxW crop -> 1x16xhxw embedding, or 1x17xhxw with a mask logit first (DensePose-CSE and its like)."""
 
     def __call__(self, crop: np.ndarray, side: int) -> np.ndarray:
         """(side, side, 16) float32 embedding of a square (S, S, 3) uint8 RGB crop, not yet normalised."""
@@ -209,6 +227,28 @@ class FeatureNetwork(Network):
         return cv2.resize(raw[0, -16:].transpose(1, 2, 0), (side, side), interpolation=cv2.INTER_LINEAR)
 
 
+class TokenNetwork(Network):
+    """1x3xHxW crop -> 1xNxC tokens of `patch` pixels (DINOv2), a few for the whole picture first; or 1xCxhxw."""
+
+    KIND = "tokens"
+
+    def __call__(self, crop: np.ndarray) -> np.ndarray:
+        """(h, w, C) float32 tokens of a square (S, S, 3) uint8 RGB crop."""
+        patch = self.contract.patch
+        size = self.size or (16 * patch, 16 * patch)
+        raw = self.run(self.prepare(crop, size))
+        if raw.ndim == 4 and raw.shape[0] == 1:
+            return np.ascontiguousarray(raw[0].transpose(1, 2, 0))
+        rows, columns = size[0] // patch, size[1] // patch
+        spare = raw.shape[1] - rows * columns if raw.ndim == 3 else -1
+        if raw.ndim != 3 or raw.shape[0] != 1 or not 0 <= spare <= 8:
+            raise BadInput(
+                f"{self.path.name} gives shape {raw.shape}, 1x{rows * columns}xC tokens expected",
+                hint="size and patch in its contract say how many",
+            )
+        return raw[0, spare:].reshape(rows, columns, -1)
+
+
 def _session(path: Path, device: str, threads: int) -> onnxruntime.InferenceSession:
     try:
         size = path.stat().st_size
@@ -216,11 +256,15 @@ def _session(path: Path, device: str, threads: int) -> onnxruntime.InferenceSess
         raise BadInput(f"the network {path.name} cannot be read ({error.strerror})") from error
     if not path.is_file() or size > MAX_BYTES:
         raise BadInput(f"the network {path.name} is not a file of at most {MAX_BYTES // 10**9} GB")
-    outside = external_data(path)
-    if outside is None:
+    found = inspect(path)
+    if found is None:
         raise BadInput(f"{path.name} is not an ONNX file, or it is damaged")
-    if outside:
-        raise BadInput(f"{path.name} keeps weights in other files ({outside[0]}); save it as one file")
+    if found.outside:
+        raise BadInput(f"{path.name} keeps weights in other files ({found.outside[0]}); save it as one file")
+    if found.foreign:
+        raise BadInput(f"{path.name} uses operators of {found.foreign[0]!r}, which are not onnxruntime's own")
+    if found.largest > HUGE:
+        raise BadInput(f"{path.name} holds or makes a tensor of {found.largest:,} elements, too large to be meant")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = max(1, threads)
     options.inter_op_num_threads = 1
