@@ -3,7 +3,8 @@
 The package that defines a pipeline names it in its ``__init__.py`` by three literals, read without importing it:
 ``PIPELINE`` (tuple of ``module:function``), ``GROUPS`` (name -> stages) and ``PRESETS`` (a TOML file beside it); a
 fourth, ``VERBS``, names commands of its own (:mod:`pipeline.verbs`); a fifth, ``EXPORTS``, the stages whose files a
-user gets (the last one where it is not there).
+user gets (the last one where it is not there); a sixth, ``NAMED_FILES``, a ``module:function`` that turns a name in a
+setting that takes a file into a path (None where it knows no such name).
 """
 
 from __future__ import annotations
@@ -62,6 +63,8 @@ class Definition:
     presets_path: Path | None
     exported: tuple[str, ...] = ()
     """Stages whose files are copied to ``exports/``: those that EXPORTS names, else the last."""
+    named_files: str = ""
+    """``module:function`` that knows files by name."""
 
     @property
     def given_suffixes(self) -> tuple[str, ...]:
@@ -99,7 +102,8 @@ def load(package: str, cache: Path | None = None) -> Definition:
     for name in exported:
         if name not in stages:
             raise BadInput(f"EXPORTS names {name!r}, which is no stage", where=folder / "__init__.py")
-    return Definition(root, stages, groups, presets, presets_path, exported)
+    named_files = str(constants.get("NAMED_FILES") or "")
+    return Definition(root, stages, groups, presets, presets_path, exported, named_files)
 
 
 def locate(package: str) -> Path:

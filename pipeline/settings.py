@@ -6,6 +6,7 @@ are the fields of that stage's settings class. On the command line: ``--stage.ke
 
 from __future__ import annotations
 
+import importlib
 import os
 import tomllib
 from dataclasses import dataclass, field
@@ -139,7 +140,19 @@ def resolve(
         values[section][key] = coerce(spec["type"], _from_text(spec["type"], text), f"--{name}", Path.cwd())
         origins[f"{section}.{key}"] = "command line"
     values["pipeline"]["preset"] = chosen
+    _name_files(definition, known, values)
     return Settings(values, origins, chosen)
+
+
+def _name_files(definition: Definition, known: dict[str, Any], values: dict[str, dict[str, Any]]) -> None:
+    """Replace files that are not there by what the pipeline knows under their names, if it knows any."""
+    module, _, function = definition.named_files.partition(":")
+    for section, fields in known.items() if module else ():
+        for spec in fields:
+            value = values[section][spec["name"]]
+            if spec["type"]["kind"] == "file" and value and not os.path.exists(value):
+                found = getattr(importlib.import_module(module), function)(os.path.basename(value))
+                values[section][spec["name"]] = found or value
 
 
 def _preset_of(written: dict[str, Any], overrides: list[tuple[str, str]], config: Path | None) -> str:

@@ -79,9 +79,13 @@ def takes_settings(verb: Verb) -> bool:
 
 
 def run_verb(verb: Verb, args: argparse.Namespace, options: Options) -> int:
-    """Run a verb on the results of a workspace; returns its exit code."""
+    """Run a verb on the results of a workspace; returns its exit code.
+
+    One that says ``NEEDS_WORKSPACE = False`` gets no results, and works where there is no workspace.
+    """
     module: Any = verb.load()
-    return int(module.run(args, Results(options.workspace)))
+    results = Results(options.workspace) if getattr(module, "NEEDS_WORKSPACE", True) else None
+    return int(module.run(args, results))
 
 
 def _summary(path: Path) -> str:

@@ -29,9 +29,14 @@ PRESETS = "presets.toml"
 EXPORTS = ("export", "report")
 """Stages whose files are copied to ``exports/``."""
 
+NAMED_FILES = "stages.registry:find"
+"""Where a setting that takes a file finds a network by name."""
+
 VERBS = {
+    "animate": "stages.verbs.animate",
     "evaluate": "stages.verbs.evaluate",
     "render": "stages.verbs.render",
     "retarget": "stages.verbs.retarget",
+    "weights": "stages.verbs.weights",
 }
 """Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""
