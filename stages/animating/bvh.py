@@ -89,7 +89,7 @@ def read_bvh(text: str) -> Bvh:
             if channel.endswith("position"):
                 shift[:, j, axis] = values[:, column]
             else:
-                turn = Rotation.from_euler("XYZ"[axis], values[:, column], degrees=True).as_matrix()
+                turn = Rotation.from_euler("XYZ"[axis], values[:, column : column + 1], degrees=True).as_matrix()
                 rotation[:, j] = rotation[:, j] @ turn
             column += 1
     return Bvh(names, parent, np.array(offsets), rotation, shift, np.arange(count) * interval)

@@ -12,7 +12,7 @@ import trimesh
 
 from tests.end_to_end.conftest import TINY, Outcome, check_store, contents, copy_program, run_banmo, snapshot, view
 
-STAGES = ("frames", "masks", "flow", "features", "poses", "fit", "correct", "refine", "export")
+STAGES = ("frames", "masks", "flow", "features", "poses", "fit", "correct", "refine", "export", "report")
 Finished = tuple[Path, Outcome]
 
 
@@ -34,7 +34,9 @@ def test_clips_become_a_model(finished: Finished, clips: Path) -> None:
         assert (exports / f"overlay-{video}.mp4").stat().st_size > 500
     assert isinstance(json.loads((exports / "quality.json").read_text()), dict)
     assert (exports / "turntable.mp4").stat().st_size > 500
-    assert check_store(workspace) == 4 * 2 + 5
+    assert check_store(workspace) == 4 * 2 + 6
+    page = (exports / "report.html").read_text(encoding="utf-8")
+    assert "cat-00" in page and "\"ran\": [{" in page, "what ran is put into the page"
 
 
 def test_the_skin_is_a_partition_of_unity(finished: Finished) -> None:

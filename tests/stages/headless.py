@@ -1,4 +1,4 @@
-"""A headless Chromium driven over its debugging pipe (Chrome DevTools Protocol): no driver, no network, no extra package."""
+"""A headless Chromium driven over its debugging pipe (Chrome DevTools Protocol): no driver, no extra package."""
 
 from __future__ import annotations
 
@@ -77,7 +77,9 @@ class Page:
     def __enter__(self) -> Page:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             self._ask("Browser.close")
             self.process.wait(10)
@@ -135,7 +137,8 @@ class Page:
 
     def open(self, path: Path) -> None:
         """Open a file from disk, offline."""
-        self.ask("Network.emulateNetworkConditions", {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0})
+        cut = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        self.ask("Network.emulateNetworkConditions", cut)
         self.ask("Page.navigate", {"url": path.resolve().as_uri()})
         self.wait("document.readyState === 'complete'")
 
