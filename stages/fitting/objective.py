@@ -18,7 +18,7 @@ from stages.model.banmo import Banmo, FrameState
 from stages.model.correspondence import match_grid, soft_argmax
 from stages.model.fields import GridField
 
-_PICTURE_TERMS = ("silhouette", "rgb", "feature", "match", "cycle_2d")
+_PICTURE_TERMS = ("silhouette", "rgb", "cover", "feature", "match", "cycle_2d")
 
 
 class Rendered(NamedTuple):
@@ -151,6 +151,9 @@ def evaluate(
         flow = project(partner.intrinsics, moved) - batch.pixels
         weight = batch.flow_confidence * inside * opacity
         add("flow", settings.weight_flow, losses.flow_loss(flow, batch.flow, weight))
+    if settings.weight_cover and step >= settings.cover_from * settings.iterations and len(model.surface):
+        uncovered = inside * (opacity < 0.3)
+        add("cover", settings.weight_cover, _cover(model, state, batch, uncovered, generator))
     if batch.features is not None:
         terms.update(_correspondence(model, state, batch, seen, inside * opacity, settings, step, draws))
     if settings.weight_cycle_3d:
@@ -163,6 +166,15 @@ def evaluate(
     for name, value in _shape_terms(model, prepared, settings, step).items():
         terms[name] = value / team.size
     return terms
+
+
+def _cover(model: Banmo, state: FrameState, batch: Batch, uncovered: Tensor, generator: torch.Generator) -> Tensor:
+    """What pulls lagging limbs: rendering has no gradient where nothing is drawn near a pixel of the object."""
+    pick = torch.randint(len(model.surface), (400,), generator=generator).to(model.surface.device)
+    points = model.surface[pick][None].expand(len(batch.frame_idx), -1, -1)
+    placed = project(state.intrinsics, transform(state.camera_from_object, model.forward_points(state, points)))
+    size = max(max(v.width, v.height) for v in model.videos)
+    return losses.coverage_loss(placed, batch.pixels, uncovered, cap_px=0.15 * size)
 
 
 def _cycle_3d(model: Banmo, state: FrameState, seen: Rendered, draws: Draws) -> Tensor:

@@ -72,6 +72,10 @@ class PhaseSettings:
     """Early on, every so many steps flow alone speaks for the pictures, so that motion leads; 0 = never."""
     flow_only_until: float = 0.3
     """Share of the phase that counts as early."""
+    weight_cover: float = 0.0
+    """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag."""
+    cover_from: float = 0.2
+    """Share of the phase from which they do; before, limbs may not be there yet."""
     weight_feature: float = 0.05
     """Rendered embedding against the pixel's features."""
     weight_match: float = 0.0

@@ -40,6 +40,17 @@ def flow_loss(rendered_px: Tensor, observed_px: Tensor, confidence: Tensor) -> T
     return (huber(error, corner=0.5, cap=8.0) * confidence).mean()
 
 
+def coverage_loss(placed_px: Tensor, pixels: Tensor, weight: Tensor, cap_px: float) -> Tensor:
+    """Distance (Huber, corner 2 px, constant beyond `cap_px`) of pixels (F, P, 2) from the nearest placed point.
+
+    `placed_px` (F, N, 2) are points of the surface in the picture, `weight` (F, P) says which pixels nothing covers.
+    """
+    nearest = torch.cdist(pixels, placed_px.detach()).argmin(-1)
+    found = placed_px.gather(1, nearest[..., None].expand(-1, -1, 2))
+    error = torch.sqrt((found - pixels).square().sum(-1) + 1e-6)
+    return (huber(error, corner=2.0, cap=cap_px) * weight).mean()
+
+
 def feature_loss(rendered: Tensor, observed: Tensor, weight: Tensor) -> Tensor:
     """Rendered feature: squared distance of embeddings (R, 16), weighted (R,)."""
     return ((rendered - observed).square().sum(-1) * weight).mean()

@@ -221,3 +221,15 @@ def test_second_difference_loop_within_videos() -> None:
     assert float(losses.second_difference(values, video)) == pytest.approx(total / count)
     steady = torch.arange(9, dtype=torch.float64)[:, None] * 0.3
     assert float(losses.second_difference(steady, torch.zeros(9))) == pytest.approx(0, abs=1e-20)
+
+
+def test_coverage_pulls_the_nearest_point_of_pixels_that_nothing_covers() -> None:
+    placed = torch.tensor([[[10.0, 10.0], [40.0, 10.0], [90.0, 90.0]]], requires_grad=True)
+    pixels = torch.tensor([[[15.0, 10.0], [40.0, 22.0], [41.0, 10.0], [10.0, 10.5]]])
+    weight = torch.tensor([[1.0, 1.0, 0.0, 1.0]])
+    value = losses.coverage_loss(placed, pixels, weight, cap_px=8.0)
+    value.backward()
+    # 5 px is beyond the corner of 2, 12 px beyond the cap of 8, half a pixel inside the corner; one pixel is covered
+    assert float(value) == pytest.approx(((5 - 1) + (8 - 1) + 0.5**2 / 4) / 4, rel=1e-3)
+    assert placed.grad is not None
+    assert float(placed.grad[0, 0, 0]) < 0 and placed.grad[0, 1].abs().max() == 0 and placed.grad[0, 2].abs().max() == 0
