@@ -12,6 +12,22 @@ from stages.registration.cues import Cues
 
 
 @dataclass(frozen=True)
+class ViewBelief:
+    """Log-probabilities of azimuth (T, A), elevation (T, E) and roll (T, R), and the angles of their bins, radians.
+
+    The angles are those of :func:`placing.view_rotation`, in the category's own frame: azimuth 0 sees the front. The
+    azimuth's bins are equal and go once round.
+    """
+
+    azimuth: np.ndarray
+    elevation: np.ndarray
+    roll: np.ndarray
+    azimuth_bins: np.ndarray
+    elevation_bins: np.ndarray
+    roll_bins: np.ndarray
+
+
+@dataclass(frozen=True)
 class Subject:
     """One clip as a provider sees it. `rotation` is set where the user gave root poses: they anchor the others."""
 
@@ -20,6 +36,8 @@ class Subject:
     intrinsics: np.ndarray  # (3, 3) pixels
     rotation: np.ndarray | None = None  # (T, 3, 3) object to crop camera, known exactly
     depth: np.ndarray | None = None  # (T,) of the object's origin, in the user's units, where the rotation is known
+    view: ViewBelief | None = None
+    """What a network that knows the category says of each frame; None for other categories."""
     frame: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
     """Full picture (H, W, 3) and mask (H, W) uint8 of one kept frame, for providers that need more than crops."""
 

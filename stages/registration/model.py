@@ -23,6 +23,7 @@ class Sequence:
     drift: np.ndarray  # (T - 1,) turn between the chosen frames that the flow suggests, radians
     step_sigma: np.ndarray  # (T - 1,) how far the turn may differ from it
     fixed: np.ndarray | None = None  # (T, A, E) posterior of clips whose poses are given
+    bearing: np.ndarray | None = None  # (T, A) log-probability of the bank's azimuths, from a network
     like: torch.Tensor | None = None  # cached Windows.like()
 
 
@@ -34,6 +35,7 @@ class Weights:
     size: float = 0.5
     smooth: float = 0.02
     empty: float = 0.001
+    bearing: float = 0.3  # a network errs alike in neighbouring frames, so each counts for less than one
     elevation_mean: float = np.radians(18.0)
     elevation_sigma: float = np.radians(12.0)
 
@@ -185,6 +187,8 @@ class Hypothesis:
         start = np.exp(-0.5 * ((elevation - self.weights.elevation_mean) / self.weights.elevation_sigma) ** 2)
         start = np.tile(start / start.sum() / len(self.bank.azimuth), (len(self.bank.azimuth), 1))
         likelihood = (-sharpness * cost).numpy().astype(np.float64).reshape(-1, *self.bank.shape)
+        if s.bearing is not None:
+            likelihood += self.weights.bearing * s.bearing[:, :, None]
         steps = azimuth_steps(self.bank.azimuth, s.drift, s.step_sigma)
         posterior, log_evidence = forward_backward(likelihood, start, steps, elevation_step(elevation, np.radians(5.0)))
         return posterior, -log_evidence / sharpness

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.registration.answer import Answer, Subject, Tell
+from stages.registration.answer import Answer, Subject, Tell, ViewBelief
 from stages.registration.cues import CROP_MARGIN
 from stages.registration.model import Hypothesis, Sequence, Weights
 from stages.registration.placing import smooth, upright_frame, view_angles, view_rotation
-from stages.registration.tracking import posterior_angles
+from stages.registration.tracking import azimuth_steps, elevation_step, forward_backward, posterior_angles
 from stages.registration.turning import expected_turns
 from stages.registration.volume import EXTENT, ViewBank
 from stages.registration.windows import Windows, whiten_together
@@ -129,8 +129,18 @@ def make_sequences(
         if subject.rotation is not None:
             azimuth, elevation, _ = view_angles(subject.rotation[idx])
             fixed = spread(bank, azimuth, elevation)
-        sequences.append(Sequence(window, np.diff(total[idx]), 0.07 * np.sqrt(gap), fixed))
+        bearing = None if subject.view is None else resample_bearing(subject.view, idx, bank.azimuth)
+        sequences.append(Sequence(window, np.diff(total[idx]), 0.07 * np.sqrt(gap), fixed, bearing))
     return sequences
+
+
+def resample_bearing(view: ViewBelief, frame_idx: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Log-probability of azimuths (K,) at some frames: (T, K), the peak of each row at 0."""
+    order = np.argsort(view.azimuth_bins % (2 * np.pi))
+    bins = view.azimuth_bins[order] % (2 * np.pi)
+    rows = view.azimuth[frame_idx][:, order]
+    read = np.stack([np.interp(azimuth % (2 * np.pi), bins, row, period=2 * np.pi) for row in rows])
+    return read - read.max(axis=1, keepdims=True)
 
 
 def spread(bank: ViewBank, azimuth: np.ndarray, elevation: np.ndarray | None, width: float = 0.12) -> np.ndarray:
@@ -145,10 +155,22 @@ def spread(bank: ViewBank, azimuth: np.ndarray, elevation: np.ndarray | None, wi
 def scatter(hypothesis: Hypothesis, random: np.random.Generator) -> None:
     """A random start: every clip at a random bearing, turning as its flow says or faster, slower, or backwards."""
     for k, s in enumerate(hypothesis.sequences):
+        if s.bearing is not None and s.fixed is None:
+            hypothesis.posterior[k] = told(hypothesis, s, random.uniform(0.1, 1.0))
+            continue
         path = np.concatenate([[0.0], np.cumsum(s.drift)]) * random.uniform(0.5, 1.5)
         path = path + np.linspace(-0.5, 0.5, len(path)) * random.normal(0.0, 1.2)
         start = random.uniform(0, 2 * np.pi)
         hypothesis.posterior[k] = spread(hypothesis.bank, path + start, None, 0.25) if s.fixed is None else s.fixed
+
+
+def told(hypothesis: Hypothesis, sequence: Sequence, weight: float) -> np.ndarray:
+    """Posterior (T, A, E) of a clip by its network's bearings and its flow alone."""
+    bank = hypothesis.bank
+    likelihood = np.repeat(weight * sequence.bearing[:, :, None], len(bank.elevation), axis=2)
+    start = np.full(bank.shape, 1 / len(bank))
+    steps = azimuth_steps(bank.azimuth, sequence.drift, sequence.step_sigma)
+    return forward_backward(likelihood, start, steps, elevation_step(bank.elevation, np.radians(5.0)))[0]
 
 
 def anneal(hypothesis: Hypothesis, first: float, last: float, rounds: int, clock: _Clock) -> None:

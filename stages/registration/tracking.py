@@ -63,3 +63,55 @@ def posterior_angles(
     """Circular mean of the azimuth (T,), mean elevation (T,), and sharpness (T,) in 0..1 of a posterior (T, A, E)."""
     mean = (posterior.sum(2) * np.exp(1j * azimuth)).sum(1)
     return np.angle(mean), (posterior.sum(1) * elevation).sum(1), np.abs(mean)
+
+
+AZIMUTHS = 90
+RATES = np.radians(np.linspace(-6.0, 6.0, 25))
+RATE_MEMORY = np.radians(0.2)
+"""Change of the turn rate from frame to frame, radians: bodies and cameras have inertia."""
+RATE_REST = np.radians(18.0)
+"""Turn rates above this, radians a frame, become unlikely."""
+
+
+def turning_posterior(
+    log_likelihood: np.ndarray, azimuth: np.ndarray, turn: np.ndarray, turn_sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Posterior (T, 90) of the azimuth of an object that turns with inertia, and the angles of its bins (90,).
+
+    The hidden state is azimuth and turn rate. Its rate changes slowly, so a stretch of frames that are mistaken for
+    their back or mirror image cannot turn the path round.
+
+    Args:
+        log_likelihood: (T, A) at `azimuth` (A,), equal bins once round, radians.
+        turn: (T - 1,) observed turn to the next frame, radians, with standard deviation `turn_sigma`.
+    """
+    bins = np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS
+    order = np.argsort(azimuth % (2 * np.pi))
+    known = (azimuth % (2 * np.pi))[order]
+    read = np.stack([np.interp(bins, known, row[order], period=2 * np.pi) for row in log_likelihood])
+    likelihood = np.exp(read - read.max(axis=1, keepdims=True))[:, :, None]
+    change = np.exp(-0.5 * ((RATES[None] - RATES[:, None]) / RATE_MEMORY) ** 2 - 0.5 * (RATES[None] / RATE_REST) ** 2)
+    change /= change.sum(axis=1, keepdims=True)
+    seen = np.exp(-0.5 * ((RATES[None] - np.asarray(turn)[:, None]) / turn_sigma) ** 2) + 1e-6
+    wave = np.fft.rfftfreq(AZIMUTHS, 1 / AZIMUTHS)
+    shift = np.exp(-1j * wave[:, None] * RATES[None])  # turning by a rate, bins or not, is a phase
+
+    def move(state: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        return np.maximum(np.fft.irfft(np.fft.rfft(state, axis=0) * phase, AZIMUTHS, axis=0), 0.0)
+
+    count = len(likelihood)
+    forward = np.empty((count, AZIMUTHS, len(RATES)))
+    state = np.exp(-0.5 * (RATES / RATE_REST) ** 2)[None].repeat(AZIMUTHS, 0)
+    for t in range(count):
+        if t:
+            state = move(forward[t - 1] * seen[t - 1], shift) @ change
+        state = state * likelihood[t]
+        forward[t] = state / state.sum() + 1e-12
+    posterior = forward.copy()
+    ahead = np.ones_like(state)
+    for t in range(count - 2, -1, -1):
+        ahead = move((ahead * likelihood[t + 1]) @ change.T, shift.conj()) * seen[t]
+        ahead = ahead / ahead.sum() + 1e-12
+        posterior[t] *= ahead
+    share = posterior.sum(axis=2)
+    return share / share.sum(axis=1, keepdims=True), bins

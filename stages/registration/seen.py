@@ -1,0 +1,72 @@
+"""Root poses by a network that knows the category: its views of single frames, tied together in time.
+
+A frame alone is often mistaken for its mirror image or its back; a clip seldom is. The network's probabilities, the
+turn that the flow suggests and a smooth path are one hidden Markov model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.registration.answer import Answer, Subject, Tell, ViewBelief
+from stages.registration.placing import OBJECT_SIZE, smooth, view_rotation
+from stages.registration.tracking import elevation_step, forward_backward, turning_posterior
+from stages.registration.turning import expected_turns
+
+FRAME_WEIGHT = 0.3
+"""What one frame's opinion counts: neighbours look alike, and err alike."""
+DOUBT = 0.1
+"""How likely a frame's opinion is to be worth nothing."""
+TURN_SHARE = 0.7
+TURN_SIGMA = 0.06
+"""A turn from frame to frame is this share of what the flow suggests, give or take the latter, radians."""
+TILT_SIGMA = np.radians(1.0)
+"""Change of elevation and roll from frame to frame, radians."""
+AGREEMENT = np.pi / 4
+
+
+def seen(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
+    """Answers for the clips that a network has looked at, in the category's own object frame (y up, z front)."""
+    del seed
+    answers = {}
+    for done, subject in enumerate(subjects):
+        tell(done, len(subjects), "views by network")
+        if subject.view is not None and subject.rotation is None:
+            answers[subject.name] = _answer(subject, subject.view)
+    return answers
+
+
+def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Azimuth, elevation and roll (T,) of a clip in radians, and how sharply the azimuth is known (T,) in 0..1."""
+    cues = subject.cues
+    say = FRAME_WEIGHT * np.where(cues.known, np.where(cues.cut, 0.5, 1.0), 0.0)[:, None]
+    azimuth = say * np.logaddexp(view.azimuth, np.log(DOUBT / view.azimuth.shape[1]))
+    turn = TURN_SHARE * expected_turns(cues)[:-1]
+    posterior, bins = turning_posterior(azimuth, view.azimuth_bins, turn, TURN_SIGMA)
+    mean = posterior @ np.exp(1j * bins)
+    tilt = [_steady(say * p, b) for p, b in ((view.elevation, view.elevation_bins), (view.roll, view.roll_bins))]
+    return smooth(np.unwrap(np.angle(mean)), 2.0), smooth(tilt[0], 2.0), smooth(tilt[1], 2.0), np.abs(mean)
+
+
+def _steady(log_likelihood: np.ndarray, bins: np.ndarray) -> np.ndarray:
+    """Posterior mean (T,) of an angle that changes slowly, from (T, B) log-likelihoods at `bins` (B,)."""
+    start = np.full((1, len(bins)), 1 / len(bins))
+    still = np.ones((len(log_likelihood) - 1, 1, 1))
+    posterior, _ = forward_backward(log_likelihood[:, None], start, still, elevation_step(bins, TILT_SIGMA))
+    return np.asarray(posterior[:, 0] @ bins)
+
+
+def _answer(subject: Subject, view: ViewBelief) -> Answer:
+    azimuth, elevation, roll, sharp = view_path(subject, view)
+    away = np.angle(np.exp(1j * (view.azimuth_bins[None] - azimuth[:, None])))
+    near = (np.exp(view.azimuth) * (np.abs(away) < AGREEMENT)).sum(axis=1)  # what the frame alone says of the path
+    trust = float(np.clip(near[subject.cues.known].mean(), 0.0, 1.0)) if subject.cues.known.any() else 0.0
+    return Answer(
+        "network",
+        view_rotation(azimuth, elevation, roll),
+        np.full(len(subject.cues), OBJECT_SIZE),
+        subject.cues.centre_px,
+        trust * sharp * np.where(subject.cues.cut, 0.5, 1.0),
+        trust,
+        {"frames_that_agree": round(trust, 3)},
+    )
