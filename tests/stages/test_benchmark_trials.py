@@ -1,0 +1,107 @@
+"""What the accuracy benchmarks rest on: perturbed poses, rotation errors, scores as printed, rows that exist."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks import ablations, optimiser, trials
+from benchmarks.tier_b import rotation_error_deg
+from stages.fitting.initialise import usable_frames
+from stages.fitting.schedule import PhaseSettings
+from stages.fitting.trainer import Trainer
+from stages.geometry.cameras import transform
+from stages.geometry.rotations import so3_exp
+from stages.optimise import FitSettings
+from tests.numerics.analytic_scene import Scene, orbit, scene, sphere
+
+PRINTED = """
+fox-00       CD   1.234 cm (pred>gt 1.100, gt>pred 1.368)   F@1%  70.10  F@2%  95.20  F@5%  99.30
+ALL          CD   1.684 cm (pred>gt 1.610, gt>pred 1.758)   F@1%  71.00  F@2%  92.24  F@5%  98.75
+frames 75, missing 0, align video
+"""
+
+
+@pytest.fixture(scope="module")
+def seen() -> Scene:
+    return scene(sphere(0.5), frames=4)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 50.0])
+def test_shaken_poses_are_turned_by_that_angle_about_the_object(degrees: float) -> None:
+    poses = orbit(40, 0.3)
+    wrong = trials.shaken(poses, degrees, seed=1)
+    centre = torch.zeros(1, 3)
+    assert torch.allclose(
+        transform(wrong, centre.expand(40, 1, 3)), transform(poses, centre.expand(40, 1, 3)), atol=1e-6
+    )
+    relative = poses[:, :3, :3].transpose(1, 2) @ wrong[:, :3, :3]
+    angle = torch.rad2deg(torch.arccos(((relative.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)))
+    assert torch.allclose(angle, torch.full((40,), degrees), atol=0.1)
+    assert torch.equal(wrong, trials.shaken(poses, degrees, seed=1))
+    if degrees:
+        assert not torch.allclose(wrong, trials.shaken(poses, degrees, seed=2))
+        assert rotation_error_deg(wrong[:, :3, :3], poses[:, :3, :3])[0] == pytest.approx(degrees, rel=0.1)
+
+
+def test_one_global_rotation_costs_nothing() -> None:
+    truth = orbit(30, 0.3)[:, :3, :3]
+    turned = truth @ so3_exp(torch.tensor([0.3, -1.0, 2.0]))
+    assert rotation_error_deg(turned, truth)[0] == pytest.approx(0, abs=0.05)
+    wrong = turned.clone()
+    wrong[0] = wrong[0] @ so3_exp(torch.tensor([0.5, 0.0, 0.0]))
+    mean, spread = rotation_error_deg(wrong, truth)
+    assert 0.5 < mean < 3 and spread > mean
+
+
+def test_the_row_of_all_frames_is_read() -> None:
+    score = trials.read_score(PRINTED)
+    assert score == trials.Score(1.684, 1.61, 1.758, 71.0, 92.24, 98.75)
+    with pytest.raises(RuntimeError, match="no row"):
+        trials.read_score("Traceback")
+
+
+def test_every_row_changes_settings_that_exist() -> None:
+    fit, correct, refine = trials.presets("preview", scale=0.5, seed=3)
+    assert fit.seed == correct.seed == refine.seed == 3
+    whole = trials.presets("preview")
+    assert abs(fit.iterations - whole[0].iterations / 2) <= 1
+    same = [
+        name
+        for name, row in ablations.ROWS.items()
+        if row.clips == 5
+        and row.given_roots
+        and (replace(fit, **row.every, **row.fit), replace(refine, **row.every)) == (fit, refine)
+    ]
+    assert same == ["full"]
+
+
+def test_a_reconstruction_of_a_ball_writes_its_surface(seen: Scene, tmp_path: Path) -> None:
+    import trimesh
+
+    known = trials.Seen(seen.observations, seen.poses, seen.intrinsics, seen.videos)
+    assert len(usable_frames(seen.observations, 99)) == 8
+    fit = FitSettings(
+        iterations=6, bones=3, voxel=0.08, pose_code=8, frames_per_step=4, pixels_per_frame=24, probe_samples=16,
+        fine_samples=8, flow_steps=(1,),
+    )  # fmt: skip
+    correct, refine = (replace(s, iterations=0) for s in trials.presets("preview")[1:])
+    model, seconds = trials.reconstruct(known, fit, correct, refine)
+    assert seconds > 0
+    trials.write_meshes(model, tmp_path, every=2, resolution=32)
+    files = sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.ply"))
+    assert files == ["clip0/00000.ply", "clip0/00002.ply", "clip1/00000.ply", "clip1/00002.ply"]
+    ball = trimesh.load(tmp_path / files[0])
+    radius = (ball.vertices**2).sum(1) ** 0.5
+    assert 0.4 < radius.mean() < 0.6 and ball.volume > 0
+
+
+def test_the_synthetic_clip_is_what_its_model_renders() -> None:
+    observations, poses, videos = optimiser.synthetic(6, rows=400)
+    trainer = Trainer(optimiser.model_of(poses, videos, "grid", "cpu"), observations, PhaseSettings(iterations=10))
+    assert float(trainer.figures().overlap.min()) > 0.9
+    assert optimiser.step_seconds(trainer, 1) > 0
+    assert optimiser.step_flops(trainer) > 1e6
