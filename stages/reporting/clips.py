@@ -31,7 +31,7 @@ def shrink_video(path: Path, most_bytes: int) -> Shrunk:
 def encoded(path: Path, scale: float, crf: int) -> bytes:
     """The same pictures at the same times, `scale` times as large, by x264 with one thread: the same bytes always."""
     target = io.BytesIO()
-    with av.open(str(path)) as source, av.open(target, "w", format="mp4", options={"movflags": "+faststart"}) as sink:
+    with av.open(str(path)) as source, av.open(target, "w", format="mp4") as sink:
         old = source.streams.video[0]
         width = max(2, round(old.codec_context.width * scale / 2) * 2)
         height = max(2, round(old.codec_context.height * scale / 2) * 2)

@@ -54,6 +54,8 @@
   for (const c of data.clips) {
     const card = make("article", "card clip-card"), head = make("div", "clip-head");
     head.append(make("h3", "", c.name), make("span", "", c.about)); card.append(head);
+    const source = provenance && provenance.videos && provenance.videos[c.name];
+    if (source && source.file && source.file !== c.name) head.append(make("span", "", `from ${source.file}`));
     const chart = BanmoCharts.line(c.agreement, { width: 1000, height: 92, low: 0, high: 1, percent: true, label: `agreement of outlines in ${c.name}` });
     if (c.video) {
       const video = make("video"); video.src = c.video; video.muted = true; video.loop = true; video.playsInline = true; video.preload = "auto";
