@@ -160,7 +160,7 @@ def write_meshes(model: Banmo, out: Path, every: int = 5, resolution: int = 128)
 
     volume, low, spacing = sample_volume(model, resolution)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=tuple(float(s) for s in spacing))
-    whole = trimesh.Trimesh(vertices + low.numpy(), faces[:, ::-1], process=False)
+    whole = trimesh.Trimesh(vertices + low.numpy(), faces, process=False)
     body = max(whole.split(only_watertight=False), key=lambda part: len(part.faces))
     points = torch.from_numpy(np.asarray(body.vertices)).float()
     for v, video in enumerate(model.videos):
