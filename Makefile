@@ -20,6 +20,8 @@ ARGS      ?=
 DATA      ?=
 LOOK      ?= clean
 EVALUATE  ?=
+# How long train-networks trains
+MINUTES   ?= 120
 
 # On a CPU shared with others, OpenMP threads that spin while they wait make torch many times slower.
 export GOMP_SPINCOUNT ?= 2000
@@ -34,7 +36,7 @@ empty  :=
 space  := $(empty) $(empty)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reconstruct stage status why inspect verify samples test soak lint bench score docs clean
+.PHONY: help setup reconstruct stage status why inspect verify samples test soak lint bench score train-networks docs clean
 
 help:  ## this list
 	@awk -F ':.*##' '/^[a-z-]+:.*##/ {printf "  make %-12s %s\n", $$1, $$2}' Makefile
@@ -96,6 +98,13 @@ bench: $(STAMP)  ## reconstruct DATA (given masks and root poses) and score it w
 score: $(STAMP)  ## score WORKSPACE against DATA with EVALUATE
 	@test -n "$(DATA)" -a -n "$(EVALUATE)" || { echo "say which: make score DATA=data/fox EVALUATE=evaluate.py [LOOK=clean]"; exit 2; }
 	$(PYTHON) -m benchmarks.score --evaluate "$(EVALUATE)" --data "$(DATA)" --look "$(LOOK)" --workspace "$(WORKSPACE)"
+
+train-networks: $(STAMP)  ## train the shipped networks anew: renderings, MINUTES of training, files in build/networks
+	$(PYTHON) -m synthetic.bank build/bank --category quadruped --bodies 180 --views 100 --seed 1
+	$(PYTHON) -m synthetic.bank build/bank --category human --bodies 180 --views 100 --seed 1
+	$(PYTHON) -m synthetic.bank build/bank --category thing --bodies 120 --views 25 --seed 1
+	$(PYTHON) -m training.train build/networks --bank build/bank --minutes "$(MINUTES)" --seed 0
+	$(PYTHON) -m training.export build/networks/state.pt build/networks/weights
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code
 	$(PYTHON) docs/generate.py
