@@ -101,7 +101,8 @@ def test_a_reconstruction_of_a_ball_writes_its_surface(seen: Scene, tmp_path: Pa
 
 def test_the_synthetic_clip_is_what_its_model_renders() -> None:
     observations, poses, videos = optimiser.synthetic(6, rows=400)
-    trainer = Trainer(optimiser.model_of(poses, videos, "grid", "cpu"), observations, PhaseSettings(iterations=10))
+    settings = PhaseSettings(iterations=10, beta_start=0.01)
+    trainer = Trainer(optimiser.model_of(poses, videos, "grid", "cpu"), observations, settings)
     assert float(trainer.figures().overlap.min()) > 0.9
     assert optimiser.step_seconds(trainer, 1) > 0
     assert optimiser.step_flops(trainer) > 1e6
