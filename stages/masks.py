@@ -31,12 +31,14 @@ from stages.formats import (
     write_image,
     write_mask_facts,
 )
-from stages.networks import NO_FILE, MaskNetwork
+from stages.networks import NO_FILE, PromptedMaskNetwork
 from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
+from stages.perception.prompts import Prompt, prompts_of
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
 from stages.perception.temporal import area_steadiness, describe
+from stages.slots import mask_network
 
 ASPECT_TOLERANCE = 0.02
 HINT_KEYS = {"frame", "time_s", "box", "inside", "outside"}
@@ -70,7 +72,7 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     elif video is not None:
         provider, result = "given-video", _certain(_from_video(video, clip, run))
     elif settings.network:
-        provider, result = "network", _from_network(clip, settings, run)
+        provider, result = "network", _from_network(clip, given, settings, run)
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
@@ -166,17 +168,33 @@ def _fit(mask: np.ndarray, clip: Clip, what: str) -> np.ndarray:
 # --------------------------------------------------------------------------------------------- network and hints
 
 
-def _from_network(clip: Clip, settings: MaskSettings, run: Run) -> Segmentation:
-    network = MaskNetwork(Path(settings.network), settings.network_contract, device=run.device, threads=run.threads)
-    run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
+def _from_network(clip: Clip, given: Given, settings: MaskSettings, run: Run) -> Segmentation:
+    network = mask_network(settings.network, settings.network_contract, device=run.device, threads=run.threads)
+    run.log.info("%s on %s", network.name, network.on)
+    run.metric("network", f"{network.name} on {network.on}")
+    prompts = _prompts(clip, given, settings, run) if isinstance(network, PromptedMaskNetwork) else []
     found = []
     for i in run.progress(range(len(clip)), label="network"):
-        found.append(np.round(network(clip.image(i)) * 255).astype(np.uint8))
+        image = clip.image(i)
+        if not isinstance(network, PromptedMaskNetwork):
+            mask = network(image)
+        elif prompts[i].empty:
+            mask = np.zeros(image.shape[:2], np.float32)
+        else:
+            mask = network(image, prompts[i].box, prompts[i].inside, prompts[i].outside)
+        found.append(np.round(mask * 255).astype(np.uint8))
     probability = np.stack(found)
     # A network that is sure says 0 or 1; the share of undecided pixels on the object's own scale lowers the trust.
     undecided = ((probability > 38) & (probability < 217)).reshape(len(clip), -1).sum(axis=1)
     object_px = (probability > 127).reshape(len(clip), -1).sum(axis=1)
     return Segmentation(probability, np.clip(1 - undecided / np.maximum(object_px, 1), 0, 1))
+
+
+def _prompts(clip: Clip, given: Given, settings: MaskSettings, run: Run) -> list[Prompt]:
+    """Where to look in each frame: the user's hints, and the built-in segmentation that they steer."""
+    hints = read_hints(given.get(".hints.toml"), clip)
+    rough = segment(clip.images(), hints, Effort(network_steps=0, seed=settings.seed), tick=_ticker(run))
+    return prompts_of(rough.probability > 127, hints)
 
 
 def read_hints(path: Path | None, clip: Clip) -> tuple[Hint, ...]:
