@@ -7,6 +7,7 @@ own name, is no record.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,8 @@ class Ledger:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._cache: dict[str, list[Record]] = {}
+        self._by_video: dict[str, dict[str | None, list[Record]]] = {}
+        self._by_input: dict[str, dict[str, list[int]]] = {}
 
     def path(self, stage: str, key: str) -> Path:
         """Where the record of this key lies."""
@@ -66,6 +69,8 @@ class Ledger:
         failpoint("before_record")
         write_json(self.path(record.stage, record.key), asdict(record), durable=True)
         self._cache.pop(record.stage, None)
+        self._by_video.pop(record.stage, None)
+        self._by_input.pop(record.stage, None)
         failpoint("after_record")
 
     def all(self, stage: str) -> list[Record]:
@@ -77,6 +82,28 @@ class Ledger:
             self._cache[stage] = sorted(records, key=lambda r: r.finished, reverse=True)
         return self._cache[stage]
 
+    def of_video(self, stage: str, video: str | None) -> list[Record]:
+        """The valid records of a stage that are of this video, newest first."""
+        records = self.all(stage)
+        if stage not in self._by_video:
+            found: dict[str | None, list[Record]] = {}
+            for record in records:
+                found.setdefault(record.video, []).append(record)
+            self._by_video[stage] = found
+        return self._by_video[stage].get(video, [])
+
+    def reading(self, stage: str, digests: set[str]) -> list[Record]:
+        """The valid records of a stage that read one of these digests for a video, newest first."""
+        records = self.all(stage)
+        if stage not in self._by_input:
+            found: dict[str, list[int]] = {}
+            for i, record in enumerate(records):
+                for digest in set(_strings(record.action.get("inputs"))) if record.video else ():
+                    found.setdefault(digest, []).append(i)
+            self._by_input[stage] = found
+        known = self._by_input[stage]
+        return [records[i] for i in sorted({i for d in digests for i in known.get(d, ())})]
+
     def stages(self) -> list[str]:
         """Names of the stages that have records."""
         return sorted(p.name for p in self.root.iterdir() if p.is_dir()) if self.root.is_dir() else []
@@ -84,6 +111,8 @@ class Ledger:
     def refresh(self) -> None:
         """Forget what was read, because another process may have written."""
         self._cache.clear()
+        self._by_video.clear()
+        self._by_input.clear()
 
 
 def parse(value: Any, stage: str, key: str) -> Record | None:
@@ -108,6 +137,15 @@ def parse(value: Any, stage: str, key: str) -> Record | None:
         and isinstance(record.warnings, list)
     )
     return record if right else None
+
+
+def _strings(value: Any) -> Iterator[str]:
+    """Every string in a nested value."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from _strings(inner)
 
 
 def _is_digest(value: Any) -> bool:

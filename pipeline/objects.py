@@ -3,7 +3,7 @@
 ``objects/<kind>/<digest>/`` holds the files, ``objects/<kind>/<digest>.sha256`` its manifest in the format of
 ``sha256sum``: ``sha256sum <digest>.sha256`` prints the folder's own name, ``sha256sum -c`` inside the folder checks it.
 
-Publishing: manifest, one ``os.sync()``, seal (the manifest file), ``rename``, read-only. A folder that is there
+Publishing: manifest, seal (the manifest file), one ``syncfs``, ``rename``, read-only. A folder that is there
 without its seal, or with other content, is damaged and is moved aside, never deleted, when its content is wanted.
 A small memo of file times (``cache/seen``) tells when a folder must be hashed again; it may be removed at any time.
 """
@@ -19,7 +19,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import StageError, printable
-from pipeline.files import failpoint, read_json, remove_tree, sha256_file, sync_folder, unique, write_atomic, write_memo
+from pipeline.files import (
+    failpoint,
+    flush,
+    read_json,
+    remove_tree,
+    sha256_file,
+    sync_folder,
+    unique,
+    write_atomic,
+    write_memo,
+)
 
 
 @dataclass(frozen=True)
@@ -105,13 +115,23 @@ class Objects:
         target = self.path(kind, digest)
         target.parent.mkdir(parents=True, exist_ok=True)
         failpoint("after_manifest")
-        _make_read_only(scratch)
-        os.sync()
-        failpoint("after_sync")
         if os.path.lexists(target) and self.deep_check(kind, digest):
             self.set_aside(kind, digest)
-        write_atomic(self.seal_path(kind, digest), manifest, durable=True)
+        if os.path.lexists(target):
+            remove_tree(scratch)  # the same bytes are there already
+        else:
+            self._move_in(scratch, target, manifest)
+        os.chmod(target, 0o555)
+        sync_folder(target.parent)
+        self._remember(kind, digest)
+        return Stored(kind, digest, target, files, total)
+
+    def _move_in(self, scratch: Path, target: Path, manifest: str) -> None:
+        _make_read_only(scratch)
+        write_atomic(target.with_name(f"{target.name}.sha256"), manifest)
         failpoint("after_seal")
+        flush(target.parent)  # the files and the seal are durable before the folder gets its name
+        failpoint("after_sync")
         try:
             os.rename(scratch, target)
         except OSError as error:
@@ -119,10 +139,6 @@ class Objects:
                 raise
             remove_tree(scratch)  # another process published the same bytes meanwhile
         failpoint("after_rename")
-        os.chmod(target, 0o555)
-        sync_folder(target.parent)
-        self._remember(kind, digest)
-        return Stored(kind, digest, target, files, total)
 
     def set_aside(self, kind: str, digest: str) -> Path | None:
         """Move a damaged folder and its seal out of the way, into ``tmp/damaged-…``; None if nothing was there."""

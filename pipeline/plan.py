@@ -138,7 +138,7 @@ class Planner:
     # ------------------------------------------------------------------ reasons
 
     def _reasons(self, node: Node, wanted: Action) -> tuple[Record | None, list[Reason]]:
-        earlier = nearest(wanted.text, self.workspace.ledger.all(node.info.name), node.video_name)
+        earlier = nearest(wanted.text, self.workspace.ledger, node.info.name, node.video_name)
         if earlier is None:
             return None, [Reason("never run")]
         assert node.info.code is not None
@@ -157,7 +157,7 @@ class Planner:
             inputs=self._inputs(node, {label: f"of {label}" for label in self._missing(node)}),
             salt=self.settings.pipeline.salt,
         ).text
-        earlier = nearest(text, self.workspace.ledger.all(info.name), node.video_name)
+        earlier = nearest(text, self.workspace.ledger, info.name, node.video_name)
         if earlier is None:
             return [Reason("never run")], None
         return compare(text, info.code.modules, earlier, self._because, self._per_video), earlier
@@ -171,7 +171,7 @@ class Planner:
         if step.status != HIT:
             return step.reasons
         now = self.results.get(label)
-        before = [r for r in self.workspace.ledger.all(stage) if r.digest == old and r.video == video]
+        before = [r for r in self.workspace.ledger.of_video(stage, video) if r.digest == old]
         if now is None or not before:
             return []
         return compare(now.action, now.modules, before[0], self._because, self._per_video)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from pipeline.ledger import Record
+from pipeline.ledger import Ledger, Record
 
 KINDS = ("never run", "settings", "input", "code", "version", "salt", "damaged", "asked for")
 
@@ -89,15 +89,15 @@ def tree(reasons: list[Reason], indent: int = 2, seen: set[str] | None = None) -
     return lines
 
 
-def nearest(text: dict[str, Any], records: list[Record], video: str | None) -> Record | None:
-    """The earlier result that differs in the fewest fields; the newest of equals (records come newest first).
+def nearest(text: dict[str, Any], ledger: Ledger, stage: str, video: str | None) -> Record | None:
+    """The earlier result that differs in the fewest fields; the newest of equals.
 
     A video that was renamed finds its records by what they read.
     """
-    mine = [r for r in records if r.video == video]
+    mine = ledger.of_video(stage, video)
     if not mine and video is not None:
-        digests = {d for d in _flat(text.get("inputs", {})).values() if d is not None}
-        mine = [r for r in records if digests & set(_flat(r.action.get("inputs", {})).values())]
+        digests = {d for d in _flat(text.get("inputs", {})).values() if isinstance(d, str)}
+        mine = ledger.reading(stage, digests)
     return min(mine, key=lambda r: len(_differences(text, r.action)), default=None)
 
 

@@ -7,6 +7,7 @@ import secrets
 import signal
 import time
 from collections.abc import Callable
+from itertools import chain
 from types import FrameType
 from typing import Any
 
@@ -19,6 +20,7 @@ from pipeline.plan import HIT, RUN, WAIT, Planner, Step
 from pipeline.request import build_request
 from pipeline.runs import RunFolder
 from pipeline.tally import Display, Report
+from pipeline.waiting import Waiting
 
 _POLL_S = 0.05
 _SILENT_S = 600.0
@@ -44,29 +46,30 @@ class Scheduler:
         self.workspace = planner.workspace
         self.report = Report()
         self._steps = {s.node.label: s for s in steps}
-        self._waiting = [s.node for s in steps if s.status == WAIT]
-        self._ready = [s.node for s in steps if s.status == RUN]
+        self._waiting = Waiting(planner.graph, (s.node for s in steps if s.status == WAIT), planner.results)
+        self._ready: dict[str, list[Node]] = {}  # by stage, in the order of the data
         self._jobs: dict[Node, Job] = {}
-        self._order = {node.label: i for i, node in enumerate(planner.graph.nodes)}
-        self._seen_results = (-1, -1)
+        self._stage_order = list(planner.graph.definition.stages)
         self._signals = 0
         self._left = False
         self._grace_s = planner.settings.execution.grace_s
         for step in steps:
             if step.status == HIT:
                 self._show_hit(step)
+            elif step.status == RUN:
+                self._make_ready(step.node)
 
     def run(self) -> Report:
         """Work until nothing is left to do, or until stopped."""
         clock = time.monotonic()
         previous = {n: signal.signal(n, self._on_signal) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
         try:
-            while (self._jobs and not self._left) or ((self._ready or self._waiting) and not self._stopping()):
+            while (self._jobs and not self._left) or (self._work_left() and not self._stopping()):
                 self._decide_waiting()
                 self._launch()
                 self._collect()
                 self.display.refresh()
-                if not self._jobs and not self._ready and self._waiting and not self._decidable():
+                if not self._jobs and not any(self._ready.values()) and not self._waiting.free:
                     break
                 time.sleep(_POLL_S)
         finally:
@@ -75,36 +78,22 @@ class Scheduler:
                     job.kill()
             for number, handler in previous.items():
                 signal.signal(number, handler)
-        self.report.not_started = [n.label for n in (*self._ready, *self._waiting)]
+        self.report.not_started = [n.label for n in (*chain(*self._ready.values()), *self._waiting)]
         self.report.seconds = time.monotonic() - clock
         return self.report
 
+    def _work_left(self) -> bool:
+        return any(self._ready.values()) or bool(self._waiting)
+
     # ------------------------------------------------------------------ deciding
 
-    def _decidable(self) -> list[Node]:
-        return [n for n in self._waiting if self._blocked_by(n) or not self._unknown_inputs(n)]
-
-    def _unknown_inputs(self, node: Node) -> list[str]:
-        inputs = [n for nodes in self.planner.graph.inputs(node).values() for n in nodes]
-        return [n.label for n in inputs if n.label not in self.planner.results]
-
-    def _blocked_by(self, node: Node) -> str | None:
-        lost = {*self.report.failed, *self.report.bad_input, *self.report.interrupted, *self.report.blocked}
-        return next((label for label in self._unknown_inputs(node) if label in lost), None)
+    def _make_ready(self, node: Node) -> None:
+        self._ready.setdefault(node.info.name, []).append(node)
 
     def _decide_waiting(self) -> None:
-        """Look at the waiting nodes again, if anything has happened since."""
-        if self._seen_results == self._results_so_far():
-            return
-        self._seen_results = self._results_so_far()
-        for node in list(self._waiting):
-            blocker = self._blocked_by(node)
-            if blocker is not None:
-                self._waiting.remove(node)
-                self.report.blocked[node.label] = blocker
-                self._tell(node, {"event": "blocked", "text": blocker})
-            elif not self._unknown_inputs(node):
-                self._waiting.remove(node)
+        """Decide the nodes whose inputs are known by now; a hit among them may free others."""
+        while free := self._waiting.take_free():
+            for node in free:
                 try:
                     step = self.planner.decide(node)
                 except BadInput as error:
@@ -115,15 +104,20 @@ class Scheduler:
                     self._show_hit(step)
                 elif needs_decision(step, self.planner.forced, self.planner.settings.pipeline.guard_minutes):
                     self.report.undecided.append(step)
-                    self.report.blocked[node.label] = "a decision"
-                    self._tell(node, {"event": "blocked", "text": "a decision"})
+                    self._block(node, "a decision")
                 else:
-                    self._ready.append(node)
+                    self._make_ready(node)
 
-    def _results_so_far(self) -> tuple[int, int]:
-        report = self.report
-        lost = len(report.failed) + len(report.bad_input) + len(report.interrupted) + len(report.blocked)
-        return len(self.planner.results), lost
+    def _block(self, node: Node, blocker: str) -> None:
+        self.report.blocked[node.label] = blocker
+        self._tell(node, {"event": "blocked", "text": blocker})
+        self._lose(node)
+
+    def _lose(self, node: Node) -> None:
+        """There will be no result of this node: who waits for it waits in vain."""
+        for reader, gone in self._waiting.lost(node.label):
+            self.report.blocked[reader.label] = gone
+            self._tell(reader, {"event": "blocked", "text": gone})
 
     def _show_hit(self, step: Step) -> None:
         assert step.record is not None
@@ -140,33 +134,45 @@ class Scheduler:
             return
         busy = {self._key(n) for n in self._jobs}
         launches: list[Launch] = []
-        for node in sorted(self._ready, key=lambda n: self._order[n.label]):
-            if self._key(node) in busy or self._made_meanwhile(node):
-                continue  # the same action under another video's name
-            grant = self.executor.take(node.info)
-            if grant is None:
-                continue
-            busy.add(self._key(node))
-            self._ready.remove(node)
-            try:
-                launch = self._prepare(node, grant)
-            except BadInput as error:
-                self.executor.give_back(grant)
-                self._refuse(node, error)
-                continue
-            if launch is not None:
-                launches.append(launch)
+        for stage in [name for name in self._stage_order if self._ready.get(name)]:
+            later: list[Node] = []
+            queue = self._ready[stage]
+            queue.reverse()
+            while queue:
+                grant = self.executor.take(queue[-1].info)
+                if grant is None:
+                    break
+                node = queue.pop()
+                launch = self._try(node, grant, busy, later)
+                if launch is None:
+                    self.executor.give_back(grant)
+                else:
+                    busy.add(self._key(node))
+                    launches.append(launch)
+            queue.reverse()
+            self._ready[stage] = later + queue
         for stage in dict.fromkeys(launch.node.info.name for launch in launches):
             self._start([launch for launch in launches if launch.node.info.name == stage])
+
+    def _try(self, node: Node, grant: Grant, busy: set[str], later: list[Node]) -> Launch | None:
+        """An attempt at a ready node, or None when there is nothing to start for it now."""
+        if self._key(node) in busy:
+            later.append(node)  # the same action under another video's name
+            return None
+        if self._made_meanwhile(node):
+            return None
+        try:
+            return self._prepare(node, grant)
+        except BadInput as error:
+            self._refuse(node, error)
+            return None
 
     def _prepare(self, node: Node, grant: Grant) -> Launch | None:
         """An attempt; None when what it reads has changed since the plan was made: then it is decided anew."""
         step = self._steps[node.label]
         request = build_request(self.planner, step, self.folder.id, grant)
         if self.planner.action(node).key != self._key(node):
-            self.executor.give_back(grant)
-            self._waiting.append(node)
-            self._seen_results = (-1, -1)
+            self._waiting.add(node)
             return None
         if step.reasons and step.reasons[0].kind == "damaged" and step.record is not None:
             self.workspace.objects.set_aside(node.info.name, step.record.digest)
@@ -203,6 +209,7 @@ class Scheduler:
         """What a node reads has become unreadable under way: it fails, the others go on."""
         self.report.bad_input[node.label] = str(error)
         self._tell(node, {"event": "bad_input", "text": str(error)})
+        self._lose(node)
 
     def _made_meanwhile(self, node: Node) -> bool:
         """Whether the result has appeared since the plan was made; then it is a hit."""
@@ -213,7 +220,6 @@ class Scheduler:
         step = self.planner.decide(node)
         if step.status != HIT:
             return False
-        self._ready.remove(node)
         self._steps[node.label] = step
         self._show_hit(step)
         return True
@@ -276,6 +282,7 @@ class Scheduler:
                 self.report.bad_input[node.label] = outcome.message
             else:
                 self.report.failed[node.label] = outcome.message
+            self._lose(node)
             if self.fail_fast:
                 self._ask_all_to_stop()
         log = os.path.relpath(job.watched.log_path, self.workspace.root)
@@ -287,6 +294,7 @@ class Scheduler:
         return step.action.key
 
     def _result(self, node: Node, digest: str) -> None:
+        self._waiting.result(node.label)
         self.folder.link(node, digest)
         if self.on_result is not None:
             self.on_result(node)

@@ -6,8 +6,10 @@ Needs the programs of a Slurm distribution (Debian: ``slurm-wlm munge``) and the
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
+import signal
 import socket
 import stat
 import subprocess
@@ -70,6 +72,11 @@ def _free_port() -> int:
         return int(server.getsockname()[1])
 
 
+def _die_with_parent() -> None:
+    """In a daemon about to start: end when the tests are killed (PR_SET_PDEATHSIG)."""
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+
+
 @dataclass
 class Cluster:
     """The running daemons. Commands find it by ``environment``."""
@@ -129,6 +136,9 @@ class Cluster:
     def stop(self) -> None:
         """End the daemons, and with them every job."""
         self.command("scancel", "--user", "root")
+        deadline = time.monotonic() + 20.0  # the daemons' own children end only with their jobs
+        while self.command("squeue", "-h").strip() and time.monotonic() < deadline:
+            time.sleep(0.5)
         for process in reversed(self.processes):
             process.terminate()
         for process in self.processes:
@@ -142,7 +152,12 @@ class Cluster:
         log = (self.root / f"{words[0]}-{len(self.processes)}.out").open("wb")
         with log:
             process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **self.environment}
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **self.environment},
+                preexec_fn=_die_with_parent,
             )
         self.processes.append(process)
 

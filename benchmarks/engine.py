@@ -1,0 +1,217 @@
+"""What the engine itself costs, without any vision: ``python -m benchmarks.engine [--videos 1000] [--actions 100000]``.
+
+Prints, from one run: the no-op run of a finished workspace (time and memory of a process of its own), the plan of many
+actions of which none has run, and publishing a folder of many files against copying and hashing the same files.
+The pipeline is the toy of the engine's tests: three results a video of three small files each, two for all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from pipeline.contract import Folder, Given, Source
+from pipeline.describe import bind, build, settings_class
+from pipeline.files import remove_tree, sha256_file
+from pipeline.graph import Node
+from pipeline.ledger import Record
+from pipeline.objects import Objects, walk
+from pipeline.plan import Planner
+from pipeline.project import Options, Project
+from pipeline.running import Run
+from pipeline.settings import stage_values
+
+TOY = Path(__file__).resolve().parent.parent / "tests" / "engine" / "toy"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.engine", description=__doc__)
+    parser.add_argument("--videos", type=int, default=1000)
+    parser.add_argument("--actions", type=int, default=100_000)
+    parser.add_argument("--files", type=int, default=3000)
+    parser.add_argument("--bytes", type=int, default=200_000, help="size of each published file")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory(prefix="banmo-engine-") as scratch:
+        root = Path(scratch)
+        shutil.copytree(TOY, root / "toy", ignore=shutil.ignore_patterns("__pycache__"))
+        sys.path.insert(0, str(root))
+        found = {
+            "no_op": measure_no_op(root, args.videos, args.repeats),
+            "plan": measure_plan(root, args.actions),
+            "publish": measure_publish(root / "publish", args.files, args.bytes, args.repeats),
+        }
+    if args.json:
+        sys.stdout.write(json.dumps(found, indent=1) + "\n")
+        return 0
+    for name, facts in found.items():
+        words = "  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in facts.items())
+        sys.stdout.write(f"{name:<8} {words}\n")
+    return 0
+
+
+def measure_no_op(root: Path, videos: int, repeats: int) -> dict[str, Any]:
+    """Seconds and peak memory of ``banmo run`` with nothing to do, Python's start included; the best of `repeats`."""
+    options = _options(root / "noop", root / "toy", videos)
+    with redirect_stdout(StringIO()):
+        results = fill(options)
+    command = [sys.executable, "-m", "pipeline.cli", "run", "--workspace", str(options.workspace)]
+    command += ["--definition", str(root / "toy"), str(options.videos)]
+    told, seconds = "", []
+    for _ in range(repeats + 1):  # the first hashes what it has not seen and fills the memos
+        clock = time.monotonic()
+        told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        seconds.append(time.monotonic() - clock)
+    if "everything is up to date" not in told:
+        raise RuntimeError(told[-500:])
+    measured = (
+        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    peak = subprocess.run([sys.executable, "-c", measured, *command], capture_output=True, text=True, check=True).stdout
+    return {
+        "videos": videos,
+        "results": results,
+        "seconds": min(seconds[1:]),
+        "first_seconds": seconds[0],
+        "peak_mb": int(peak.split()[-1]) / 1000,
+    }
+
+
+def measure_plan(root: Path, actions: int) -> dict[str, Any]:
+    """Seconds and memory to plan so many actions of which none has run, in this process."""
+    options = _options(root / "plan", root / "toy", (actions - 2 + 2) // 3)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    clock = time.monotonic()
+    project = Project.open(options, create=True)
+    planner = project.planner()
+    steps = planner.plan(project.graph.nodes)
+    seconds = time.monotonic() - clock
+    clock = time.monotonic()
+    project.planner().plan(project.graph.nodes)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    return {
+        "actions": len(steps),
+        "seconds": seconds,
+        "again_seconds": time.monotonic() - clock,
+        "bytes_an_action": 1024 * grown / len(steps),
+    }
+
+
+def measure_publish(root: Path, files: int, size: int, repeats: int) -> dict[str, Any]:
+    """Publishing a folder against copying it and hashing it, each the best of `repeats`, taken in turns."""
+    source = root / "source"
+    source.mkdir(parents=True)
+    for i in range(files):
+        (source / f"{i:05d}.bin").write_bytes(os.urandom(size))
+    published, reference = [], []
+    for i in range(repeats):
+        reference.append(_timed(lambda place=root / f"copy-{i}": _copy_and_hash(source, place)))  # type: ignore[misc]
+        store = Objects(root / f"store-{i}", seen=root / f"seen-{i}", tmp=root / f"tmp-{i}")
+        scratch = root / f"scratch-{i}"
+        published.append(
+            _timed(lambda to=scratch, into=store: (_copy(source, to), into.publish("frames", to)))  # type: ignore[misc]
+        )
+        for path in (root / f"copy-{i}", store.root):
+            remove_tree(path)
+    return {
+        "files": files,
+        "bytes": files * size,
+        "seconds": min(published),
+        "copy_and_hash_seconds": min(reference),
+        "ratio": min(published) / min(reference),
+    }
+
+
+def fill(options: Options) -> int:
+    """Finish a workspace of the toy pipeline within this process, without workers; returns the number of results."""
+    project = Project.open(options, create=True)
+    planner = project.planner()
+    clock = time.time()
+    with mock.patch("pipeline.objects.flush"), mock.patch("os.fsync"):  # durability is not what is measured here
+        for node in project.graph.nodes:
+            step = planner.decide(node)
+            assert step.action is not None and node.info.code is not None
+            out = project.workspace.tmp / "out"
+            out.mkdir(parents=True)
+            _call(project, planner, node, out)
+            stored = project.workspace.objects.publish(node.info.name, out)
+            record = Record(
+                key=step.action.key, stage=node.info.name, video=node.video_name, action=step.action.text,
+                modules=node.info.code.modules, digest=stored.digest, files=stored.files, bytes=stored.bytes,
+                seconds=0.0, started=_stamp(clock), finished=_stamp(clock), run="benchmark",
+            )  # fmt: skip
+            project.workspace.ledger.write(record)
+            planner.finished(node, record)
+    project.workspace.remember(project.remembered)
+    return len(planner.results)
+
+
+def _call(project: Project, planner: Planner, node: Node, out: Path) -> None:
+    module, _, name = node.info.reference.partition(":")
+    stage = getattr(importlib.import_module(module), name)
+    known: dict[str, Any] = {"out": out, "run": Run(video=node.video_name, checkpoint_dir=out.parent / "checkpoint")}
+    for source, nodes in project.graph.inputs(node).items():
+        folders = {
+            n.video_name: Folder(project.workspace.objects.path(source, planner.results[n.label].digest)) for n in nodes
+        }
+        many = node.video is None and nodes[0].video is not None
+        known[source] = folders if many else next(iter(folders.values()))
+    if node.video is not None:
+        known |= {"video": Source(node.video.path, node.video.name), "given": Given()}
+    kind = settings_class(stage)
+    if kind is not None:
+        known["settings"] = build(kind, stage_values(project.settings, node.info))
+    with redirect_stdout(StringIO()):
+        stage.function(**bind(stage, stage.function, known))
+    remove_tree(out.parent / "checkpoint")
+
+
+def _options(root: Path, package: Path, videos: int) -> Options:
+    clips = root / "clips"
+    clips.mkdir(parents=True)
+    for i in range(videos):
+        (clips / f"clip-{i:06d}.mp4").write_text(f"clip {i}")
+    return Options(workspace=root / "w", definition=str(package), videos=clips)
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.mkdir(parents=True)
+    for name, path, _ in walk(source):
+        shutil.copyfile(path, target / name)
+
+
+def _copy_and_hash(source: Path, target: Path) -> None:
+    _copy(source, target)
+    for _, path, _ in walk(target):
+        sha256_file(path)
+
+
+def _timed(work: Callable[[], object]) -> float:
+    clock = time.monotonic()
+    work()
+    return time.monotonic() - clock
+
+
+def _stamp(seconds: float) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%S.000Z", time.gmtime(seconds))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
