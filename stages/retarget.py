@@ -15,19 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Scene, stage
+from pipeline import BadInput, Folder, InputFile, Resources, Run, Scene, stage
 from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection, collect
+from stages.fitting.observations import ObservationBuilder
 from stages.model.banmo import Banmo
-from stages.model.motion import octaves_for
+from stages.model.motion import octaves_for, splines_for
 from stages.networks import NO_FILE
-from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
-from stages.registration.placing import default_intrinsics
 from stages.retargeting.articulation import first_articulation, known_shapes, spread
 from stages.retargeting.driven import ClipSettings, ClipTrainer, driven_model, known_codes, start_codes
+from stages.retargeting.placing import Placed, register, turn_onto
 
-GIVEN = ".poses.json"
 _KEPT = ("model.safetensors", "model.json")
 _RIG = ("model.glb", "bones.json", "rest.ply")
 _CHECKPOINT_STEPS = 50
@@ -45,16 +44,12 @@ class KnownSettings:
 
 @dataclass(frozen=True)
 class OntoSettings:
-    """Root poses of the driving clip."""
+    """How root poses of the driving clip are brought onto the known model."""
 
-    provider: str = "auto"
-    """auto (given, else searched) or given (refuse to guess)."""
-    focal_px: float = 0.0
-    """Focal length in pixels of the kept frames; 0 takes the file's own hint, or else the longer side."""
     shapes: int = 10
     """Articulations of the known model that are tried in each direction."""
-    refine: bool = False
-    """Let root poses that were given move; searched ones always do."""
+    search: str = "auto"
+    """auto, turn (keep the estimated rotations, turn them as a whole onto the model) or silhouettes (look anew)."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +60,8 @@ class TrackSettings(ClipSettings):
     """Steps of gradient descent."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
+    motion_spacing_s: float = 0.0
+    """Spacing of local functions of time that join the pose codes; 0 = none."""
     same_subject: bool = False
     """The clip shows the very subject of the model: its colours count."""
     known_frames: int = 160
@@ -82,7 +79,7 @@ class TrackSettings(ClipSettings):
     lr_motion: float = 1e-2
     """Step size of the clip's body pose code."""
     lr_root: float = 2e-3
-    """Step size of its root pose correction; given poses are held whatever it is (see onto.refine)."""
+    """Step size of its root pose correction; given poses are held whatever it is (see poses.refine)."""
     lr_environment: float = 1e-2
     """Step size of its light code, where colours count."""
     warmup_steps: int = 20
@@ -112,31 +109,39 @@ def known(settings: KnownSettings, out: Path, run: Run) -> None:
     run.metric("videos", len(formats.read_json(out / "model.json")["videos"]))
 
 
-@stage(per=Scene, version=1, given=(GIVEN,), needs=Resources(cpus="all"))
+@stage(per=Scene, version=1, needs=Resources(cpus="all"))
 def onto(
     known: Folder,
     frames: dict[str, Folder],
     masks: dict[str, Folder],
-    given: dict[str, Given],
+    poses: Folder,
     settings: OntoSettings,
     out: Path,
     run: Run,
 ) -> None:
-    """Root poses of the clip on the known model: given beside it, or searched for by its silhouettes."""
-    if settings.provider not in ("auto", "given"):
-        raise BadInput(f"onto.provider is {settings.provider!r}", hint="known: auto, given")
+    """Root poses of the clip in the known model's frame and scale; poses that were given are taken as they are."""
+    if settings.search not in ("auto", "turn", "silhouettes"):
+        raise BadInput(f"onto.search is {settings.search!r}", hint="known: auto, turn, silhouettes")
     torch.set_num_threads(max(1, run.threads))
+    said = formats.read_json(poses / "poses.json")["videos"]
     videos: dict[str, dict[str, Any]] = {}
     for name, folder in frames.items():
         clip = formats.read_clip(folder.path)
-        path = given[name].get(GIVEN)
-        if path is None and settings.provider == "given":
-            raise BadInput(f"there are no root poses beside {name}", hint=f"add {name}{GIVEN}, or set onto.provider")
-        track = _given(path, clip) if path else _searched(known, clip, masks[name], settings, run)
+        track = formats.read_poses(poses / f"{name}.json")
+        provider = said[name]["provider"]
+        misfit = 0.0
+        if provider != "given":
+            track, misfit = _onto_model(known, clip, masks[name], track, float(said[name]["trust"]), settings, run)
         trust = float(track.confidence.mean())
-        fixed = path is not None and not settings.refine
-        videos[name] = {"provider": track.provider[0], "score": trust, "trust": round(trust, 4), "fixed": fixed}
+        videos[name] = {
+            "provider": track.provider[0],
+            "score": round(trust, 4),
+            "trust": round(trust, 4),
+            "misfit": round(misfit, 4),
+            "fixed": bool(said[name]["fixed"]) and provider == "given",
+        }
         formats.write_poses(out / f"{name}.json", track, clip)
+        run.metric(f"misfit_{name}", round(misfit, 4))
         if trust < 0.5:
             run.warn(f"root poses of {name} on the model are a guess (trust {100 * trust:.0f} %); look at the overlay")
     formats.write_json(out / "poses.json", {"videos": videos, "trust": min(v["trust"] for v in videos.values())})
@@ -201,33 +206,16 @@ def _check_track(out: Path) -> None:
 # --------------------------------------------------------------------------------------------- parts
 
 
-def _given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
-    """The user's own poses at the kept frames, in pixels of those frames."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(document, dict):
-            raise PoseDocumentError("is not a JSON object with K and object_to_camera")
-        matrices = parse_transforms(document, len(clip.source_time_s))
-        intrinsics = parse_intrinsics(document)
-    except (OSError, ValueError, RecursionError) as error:
-        what = str(error) if isinstance(error, PoseDocumentError) else f"cannot be read as JSON ({error})"
-        raise BadInput(
-            f"{path.name} {what}", hint="give K and one rigid 4x4 object_to_camera a source frame"
-        ) from error
-    info = formats.read_json(clip.root / "frames.json")
-    scale_x = clip.width / float(info.get("source_width", clip.width))
-    scale_y = clip.height / float(info.get("source_height", clip.height))
-    kept = matrices[clip.source_idx]
-    return formats.PoseTrack(
-        scale_intrinsics(intrinsics, scale_x, scale_y), kept, np.ones(len(kept)), ["given"] * len(kept)
-    )
-
-
-def _searched(known: Folder, clip: formats.Clip, masks: Folder, settings: OntoSettings, run: Run) -> formats.PoseTrack:
-    """Root poses by comparing the model's known shapes with the masks, from everywhere."""
-    from stages.fitting.observations import ObservationBuilder
-    from stages.retargeting.placing import register
-
+def _onto_model(
+    known: Folder,
+    clip: formats.Clip,
+    masks: Folder,
+    track: formats.PoseTrack,
+    trust: float,
+    settings: OntoSettings,
+    run: Run,
+) -> tuple[formats.PoseTrack, float]:
+    """An estimated track turned onto the model, or one found anew by silhouettes; with its misfit."""
     model = Banmo.restore(*formats.read_model(known.path))
     surface = model.surface[spread(len(model.surface), 120)]
     shapes = known_shapes(model, spread(len(model.time), settings.shapes), surface)
@@ -240,12 +228,25 @@ def _searched(known: Folder, clip: formats.Clip, masks: Folder, settings: OntoSe
     observations = builder.finish()
     if not (observations.frame_weight > 0).any():
         raise BadInput("no frame of the clip shows the object", hint="give masks or a hints file beside it")
-    k = default_intrinsics(clip.width, clip.height, settings.focal_px or clip.focal_hint_px)
-    found = register(shapes, torch.from_numpy(k).float(), observations, facts.box)
-    poses = found.poses.double().numpy()
+    k = torch.from_numpy(track.intrinsics).float()
+    rotations = torch.from_numpy(track.object_to_camera[:, :3, :3]).float()
+    found: list[tuple[float, str, Placed]] = []
+    if settings.search in ("auto", "turn"):
+        placed = turn_onto(shapes, rotations, k, observations, facts.box)
+        # A track that knows near from far is worth more than outlines, which do not: it wins unless it fits far worse.
+        found.append((placed.misfit * (0.6 if trust >= 0.5 else 0.9), "turned onto the model", placed))
+    if settings.search in ("auto", "silhouettes"):
+        placed = register(shapes, k, observations, facts.box)
+        found.append((placed.misfit, "silhouettes", placed))
+    _, provider, best = min(found, key=lambda row: row[0])
+    run.log.info("root poses: %s", ", ".join(f"{name} misfit {p.misfit:.4f}" for _, name, p in found))
+    poses = best.poses.double().numpy()
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
-    return formats.PoseTrack(k, poses, found.confidence.numpy().astype(np.float64), ["silhouettes"] * len(clip))
+    confidence = best.confidence.numpy().astype(np.float64)
+    if provider != "silhouettes":
+        confidence = np.minimum(confidence, np.maximum(track.confidence, 0.3))
+    return formats.PoseTrack(track.intrinsics, poses, confidence, [provider] * len(clip)), best.misfit
 
 
 def _weights(settings: TrackSettings) -> TrackSettings:
@@ -256,8 +257,10 @@ def _weights(settings: TrackSettings) -> TrackSettings:
 def _first(model: Banmo, collection: Collection, settings: TrackSettings, run: Run) -> Banmo:
     """The driven model with each frame in the known articulation that fits its mask best."""
     video = collection.videos[0]
-    octaves = octaves_for(video.time_s[-1] - video.time_s[0], settings.motion_period_s)
-    driven = driven_model(model, video, collection.camera_from_object, octaves, settings.seed)
+    length = video.time_s[-1] - video.time_s[0]
+    octaves = octaves_for(length, settings.motion_period_s)
+    splines = splines_for(length, settings.motion_spacing_s)
+    driven = driven_model(model, video, collection.camera_from_object, octaves, settings.seed, splines)
     driven.root_free.copy_(1 - collection.root_fixed)
     start, misfit = first_articulation(
         model,

@@ -1,6 +1,6 @@
 """Retargeting as a pipeline of its own: one clip in, the motion of a known model out (``banmo retarget``).
 
-clip -> frames -> masks, flow, features -> onto (root poses on the known model) -> track (its codes) -> motion (files)
+clip -> frames -> masks, flow, features -> poses -> onto (on the known model) -> track (codes) -> motion (files)
 
 It runs in a workspace of its own, so that it is kept, resumed and explained like everything else.
 """
@@ -10,6 +10,7 @@ PIPELINE = (
     "stages.masks:masks",
     "stages.flow:flow",
     "stages.features:features",
+    "stages.poses:poses",
     "stages.retarget:known",
     "stages.retarget:onto",
     "stages.retarget:track",

@@ -16,7 +16,6 @@ from stages.fitting.observations import Observations
 from stages.fitting.schedule import PhaseSettings
 from stages.fitting.trainer import Trainer
 from stages.model.banmo import Banmo, VideoFacts
-from stages.model.motion import fourier_basis
 
 _OF_ONE_VIDEO = (
     "base_poses",
@@ -35,16 +34,18 @@ def known_codes(model: Banmo) -> Tensor:
         return model.body.code(model.video_idx, model.time)
 
 
-def driven_model(model: Banmo, video: VideoFacts, base_poses: Tensor, octaves: int, seed: int) -> Banmo:
+def driven_model(
+    model: Banmo, video: VideoFacts, base_poses: Tensor, octaves: int, seed: int, splines: int = 0
+) -> Banmo:
     """The same model with one other video, at `base_poses` (T, 4, 4), camera_from_object.
 
     Args:
         model: the known one; it is not touched.
         video: name, kept frame times and camera of the driving clip.
-        octaves: octaves of its body pose code (see :func:`stages.model.motion.octaves_for`).
+        octaves, splines: functions of time of its body pose code (see :mod:`stages.model.motion`).
         seed: of the codes' small random start around the mean over the known frames.
     """
-    architecture = replace(model.architecture, octaves=octaves)
+    architecture = replace(model.architecture, octaves=octaves, splines=splines)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -70,12 +71,13 @@ def driven_model(model: Banmo, video: VideoFacts, base_poses: Tensor, octaves: i
 def start_codes(driven: Banmo, codes: Tensor, ridge: float = 0.02) -> None:
     """Set the body code of the one video so that it follows `codes` (T, C) at its kept frames.
 
-    Ridge regression onto the Fourier basis; high octaves are held back more, so that the start is smooth.
+    Ridge regression onto the code's functions of time; high octaves are held back more, so that the start is smooth.
     """
     code = driven.body.code
-    basis = fourier_basis(driven.time, code.octaves).double()
+    basis = code.basis(driven.time).double()
     octave = torch.arange(code.octaves, dtype=torch.float64)
-    price = torch.cat([torch.tensor([1e-6, 1e-2], dtype=torch.float64), 4.0**octave, 4.0**octave])
+    first = torch.tensor([1e-6, 1e-2], dtype=torch.float64)
+    price = torch.cat([first, 4.0**octave, 4.0**octave, torch.full((code.splines,), 4.0**code.octaves).double()])
     gram = basis.T @ basis + ridge * torch.diag(price)
     code.coefficients.copy_(torch.linalg.solve(gram, basis.T @ codes.double())[None].float())
 
