@@ -345,6 +345,10 @@ def _train(
             trainer.rate_scale, history = scale, saved.history
             team.wait()
             continue
+        if trainer.renewal_error is not None:
+            run.log.info("new bones follow the old motion to %.4f units (rms)", trainer.renewal_error)
+            run.metric("renewed_bones_rms", round(trainer.renewal_error, 5))
+            trainer.renewal_error = None
         if trainer.step_idx % _METRIC_STEPS == 0 or trainer.done:
             history.append({"step": trainer.step_idx, **{k: round(v, 7) for k, v in values.items()}})
         run.tick(trainer.step_idx, settings.iterations, label, loss=values["total"])

@@ -40,6 +40,7 @@ class Trainer:
         self.step_idx = 0
         self.rate_scale = 1.0
         self.trust = torch.ones(len(observations))
+        self.renewal_error: float | None = None  # units; see renew_bones
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
             octaves = model.architecture.octaves
@@ -186,7 +187,7 @@ class Trainer:
         if len(self.model.surface) < 100:
             return
         renew_bounds(self.model, margin=0.2)
-        renew_bones(self.model, self.settings.seed + self.step_idx)
+        self.renewal_error = renew_bones(self.model, self.settings.seed + self.step_idx)
         self._agree()
         self.refresh()
         self.optimiser = self._optimiser()

@@ -54,6 +54,7 @@ def straight(seen: Scene) -> tuple[dict[int, Saved], list[dict[str, float]]]:
     trainer = Trainer(first_model(seen), seen.observations, SETTINGS)
     saved, values = {}, []
     while not trainer.done:
+        assert (trainer.renewal_error is not None) == (trainer.step_idx > RENEW)
         saved[trainer.step_idx] = trainer.state(), json.loads(json.dumps(trainer.model.describe()))
         values.append(trainer.step())
     saved[STEPS] = trainer.state(), trainer.model.describe()
