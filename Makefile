@@ -16,6 +16,7 @@ PRESET    ?=
 STAGE     ?=
 VIDEO     ?=
 ARGS      ?=
+MINUTES   ?= 10
 # Evaluation data and script of your own; see benchmarks/
 DATA      ?=
 LOOK      ?= clean
@@ -36,7 +37,7 @@ empty  :=
 space  := $(empty) $(empty)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup reconstruct stage status why inspect verify samples test soak lint bench score train-networks docs clean
+.PHONY: help setup reconstruct stage status why inspect verify samples test soak fuzz test-slurm lint bench score train-networks docs clean
 
 help:  ## this list
 	@awk -F ':.*##' '/^[a-z-]+:.*##/ {printf "  make %-12s %s\n", $$1, $$2}' Makefile
@@ -82,8 +83,17 @@ verify: $(STAMP)  ## read every stored byte and compare digests
 test: $(STAMP)  ## every test
 	$(PYTHON) -m pytest $(ARGS)
 
-soak: $(STAMP)  ## kill the pipeline at 20 random moments and compare with an undisturbed run
+soak: $(STAMP)  ## kill writers 500 times and whole runs 20 times; compare with undisturbed ones (MINUTES bounds it)
+	BANMO_SOAK_KILLS=500 BANMO_SOAK_MINUTES=$(MINUTES) $(PYTHON) -m pytest tests/crash/test_crash_soak.py -s $(ARGS)
+	BANMO_MODEL_EXAMPLES=400 $(PYTHON) -m pytest tests/crash/test_crash_model.py $(ARGS)
+	BANMO_RUN_KILLS=20 $(PYTHON) -m pytest tests/crash/test_crash_kill.py $(ARGS)
 	BANMO_SOAK=20 $(PYTHON) -m pytest tests/end_to_end/test_kill.py -s $(ARGS)
+
+fuzz: $(STAMP)  ## 100,000 damaged inputs for each reader of foreign files (MINUTES bounds it)
+	BANMO_FUZZ=100000 BANMO_FUZZ_MINUTES=$(MINUTES) $(PYTHON) -m pytest tests/fuzz -s $(ARGS)
+
+test-slurm: $(STAMP)  ## a real Slurm of two nodes on this machine (Debian: slurm-wlm munge); needs the superuser
+	BANMO_SLURM=1 $(PYTHON) -m pytest tests/slurm $(ARGS)
 
 lint: $(STAMP)  ## style
 	$(PYTHON) -m ruff check .

@@ -48,6 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # as the engine sets it for its workers
     with tempfile.TemporaryDirectory(prefix="banmo-engine-") as scratch:
         root = Path(scratch)
         shutil.copytree(TOY, root / "toy", ignore=shutil.ignore_patterns("__pycache__"))

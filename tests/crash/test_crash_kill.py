@@ -19,13 +19,13 @@ from tests.engine.laboratory import Lab
 FAILPOINTS = (
     "before_publish",
     "after_manifest",
-    "after_sync",
     "after_seal",
+    "after_sync",
     "after_rename",
     "before_record",
     "after_record",
 )
-KILLS = int(os.environ.get("BANMO_SOAK_KILLS", "20"))
+KILLS = int(os.environ.get("BANMO_RUN_KILLS", "5"))
 SEED = int(os.environ.get("BANMO_SOAK_SEED", "0"))
 BUSY = ("--words.delay_s", "0.02", "--merge.steps", "5", "--merge.delay_s", "0.05")
 
