@@ -37,6 +37,7 @@ VERBS = {
     "evaluate": "stages.verbs.evaluate",
     "render": "stages.verbs.render",
     "retarget": "stages.verbs.retarget",
+    "view": "stages.verbs.view",
     "weights": "stages.verbs.weights",
 }
 """Commands of the pipeline's own: name -> module; see ``pipeline/verbs.py``."""
