@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import sys
 import time
 from pathlib import Path
@@ -51,9 +53,12 @@ def run(args: argparse.Namespace, results: Results) -> int:
             where=results.workspace,
             hint="banmo run, in another terminal",
         )
-    server = viser.ViserServer(host=args.host, port=args.port, label="banmo", verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # it has a banner of its own
+        server = viser.ViserServer(host=args.host, port=args.port, label="banmo", verbose=False)
     try:
         server.scene.set_up_direction("+y")
+        server.initial_camera.position = (2.2, 1.0, 3.0)
+        server.initial_camera.look_at = (0.0, 0.0, 0.0)
         view = _play(server, finished) if finished is not None else _grow(server, growing)
         where = _LOOPBACK if args.host in ("0.0.0.0", "::") else args.host
         sys.stdout.write(f"http://{where}:{server.get_port()}  (Ctrl-C ends it)\n")
@@ -89,9 +94,14 @@ def _finished(args: argparse.Namespace, results: Results) -> Finished | None:
 
 def _draw(server: Any, shown: Shown, wireframe: bool, bones: bool) -> None:
     """Put a mesh (again) into the scene."""
-    server.scene.add_mesh_simple(
-        "/model", shown.vertices.astype("float32"), shown.faces, color=shown.colours, wireframe=wireframe, side="double"
-    )
+    import trimesh
+
+    if wireframe:
+        edges = {"color": (90, 95, 100), "wireframe": True, "side": "double"}
+        server.scene.add_mesh_simple("/model", shown.vertices.astype("float32"), shown.faces, **edges)
+    else:
+        mesh = trimesh.Trimesh(shown.vertices, shown.faces, vertex_colors=shown.colours, process=False)
+        server.scene.add_mesh_trimesh("/model", mesh)
     if bones and len(shown.bones):
         server.scene.add_line_segments("/bones", shown.bones.astype("float32"), (25, 25, 30), thickness=0.008)
     elif not bones:
@@ -99,29 +109,32 @@ def _draw(server: Any, shown: Shown, wireframe: bool, bones: bool) -> None:
 
 
 def _play(server: Any, finished: Finished) -> Any:
-    """Controls of a finished model; returns what draws the next picture and says how long to wait."""
+    """Controls of a finished model; returns what draws what was asked for and says how long to wait.
+
+    A playing clip goes to the browser whole, which plays it by itself; a moment of it is one mesh.
+    """
     rest = "at rest"
     gui = server.gui
     clip = gui.add_dropdown("Clip", (*finished.clips, rest))
-    clock = gui.add_slider("Time (share)", 0.0, 1.0, 0.005, 0.0)
     playing = gui.add_checkbox("Play", True)
-    speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
+    clock = gui.add_slider("Moment (share of the clip)", 0.0, 1.0, 0.005, 0.0)
     look = gui.add_dropdown("Colours", finished.looks)
     wire, bones = gui.add_checkbox("Wireframe", False), gui.add_checkbox("Bones", False)
     drawn: list[tuple[Any, ...]] = [()]
-    last = [time.monotonic()]
 
     def step() -> float:
-        now = time.monotonic()
-        passed, last[0] = now - last[0], now
-        length = finished.seconds(clip.value)
-        if playing.value and length > 0:
-            clock.value = (clock.value + passed * speed.value / length) % 1.0
-        wanted = (clip.value, clock.value, look.value, wire.value, bones.value)
+        whole = playing.value and clip.value != rest and not wire.value and not bones.value
+        clock.disabled = whole
+        wanted = (clip.value, whole or clock.value, look.value, wire.value, bones.value)
         if wanted != drawn[0]:
             drawn[0] = wanted
-            _draw(server, finished.at(clip.value, clock.value * length, look.value), wire.value, bones.value)
-        return 1 / 20
+            if whole:
+                server.scene.remove_by_name("/bones")
+                server.scene.add_glb("/model", finished.playing(clip.value, look.value))
+            else:
+                moment = clock.value * finished.seconds(clip.value)
+                _draw(server, finished.at(clip.value, moment, look.value), wire.value, bones.value)
+        return 1 / 10
 
     step()
     return step

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from stages.animating.playing import Player
+from stages.animating.adding import pack_glb
+from stages.animating.playing import ROOT_MOTION, Player
 from stages.checkpoint import Checkpoints
 from stages.meshing.pictures import joint_palette
 
@@ -64,6 +66,32 @@ class Finished:
         bones = np.array([[joints[0, p], joints[0, j]] for j, p in pairs]).reshape(-1, 2, 3)
         vertices = self.player.surface(scene)[0]
         return Shown(vertices, self.player.faces, to_bytes(self._colours(look, vertices)), bones)
+
+    def playing(self, clip: str, look: str) -> bytes:
+        """A GLB that holds one clip, in place, coloured as `look` says: browsers play it smoothly by themselves."""
+        glb = self.player.glb
+        document = copy.deepcopy(glb.document)
+        document["animations"] = [a for a in document.get("animations", []) if a.get("name") == clip]
+        roots = {n for n, name in enumerate(glb.names) if name == ROOT_MOTION}
+        for record in document["animations"]:
+            record["channels"] = [c for c in record["channels"] if c["target"].get("node") not in roots]
+        blob = bytearray(glb.blob)
+        if look != "colour":
+            blob.extend(b"\0" * (-len(blob) % 4))
+            colours = to_bytes(self._colours(look, self.player.vertices)).astype(np.float64) / 255
+            linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+            raw = np.ascontiguousarray(linear, np.float32).tobytes()
+            document["bufferViews"].append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(raw)})
+            blob.extend(raw)
+            view = len(document["bufferViews"]) - 1
+            accessor = {"bufferView": view, "componentType": 5126, "count": len(linear), "type": "VEC3"}
+            document["accessors"].append(accessor)
+            attributes = document["meshes"][0]["primitives"][0]["attributes"]
+            attributes["COLOR_0"] = len(document["accessors"]) - 1
+            for material in document.get("materials", []):
+                material.get("pbrMetallicRoughness", {}).pop("baseColorTexture", None)
+            document["buffers"][0]["byteLength"] = len(blob)
+        return pack_glb(document, bytes(blob))
 
     def _colours(self, look: str, vertices: np.ndarray) -> np.ndarray:
         if look == "bones' skin":
