@@ -109,6 +109,7 @@ def reconstruct(
 ) -> tuple[Banmo, float]:
     """The three phases one after the other; returns the model and the processor seconds that optimisation took."""
     normal = initialise.normalise(seen.observations, seen.poses, seen.intrinsics)
+    room = None
     if fit.start == "sphere":
         generator = torch.Generator().manual_seed(fit.seed)
         solid = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
@@ -116,7 +117,7 @@ def reconstruct(
     else:
         poses, k = normal.camera_from_canonical, seen.intrinsics
         hull = initialise.rigid_hull(seen.observations, poses, k, HULL_VOXEL)
-        solid = hull.nodes[hull.solid]
+        solid, room = hull.nodes[hull.solid], initialise.swept(hull, fit.bones_share)
     architecture = Architecture(
         representation=fit.representation,
         voxel=fit.voxel,
@@ -137,6 +138,7 @@ def reconstruct(
         fit.bones,
         fit.seed,
         fit.margin,
+        room,
     )
     if hold_roots:
         model.root_free.zero_()

@@ -57,6 +57,9 @@ class FitSettings(PhaseSettings):
     """Channels of the trunk when representation = mlp."""
     bones: int = 25
     """Number of bones."""
+    bones_share: float = 0.0
+    """First bones lie where at least this share of the masks has something, so that swinging limbs get some; 0 = only
+    in the first hull."""
     start: str = "hull"
     """hull (soft visual hull of the masks) or sphere (the paper's)."""
     margin: float = 0.3
@@ -201,7 +204,7 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
         octaves=initialise.octaves(collection.videos, settings.motion_period_s),
         splines=initialise.splines(collection.videos, settings.motion_spacing_s),
     )
-    free = 1 - collection.root_fixed
+    free, room = 1 - collection.root_fixed, None
     if settings.start == "sphere":
         generator = torch.Generator().manual_seed(settings.seed)
         solid = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
@@ -210,7 +213,7 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
         hull = initialise.rigid_hull(
             collection.observations, normal.camera_from_canonical, collection.intrinsics, _HULL_VOXEL
         )
-        solid = hull.nodes[hull.solid]
+        solid, room = hull.nodes[hull.solid], initialise.swept(hull, settings.bones_share)
         run.log.info("hull: vote level %.2f, %d voxels", hull.level, len(solid))
         run.metric("hull_level", hull.level)
         if len(solid) < 50:
@@ -227,6 +230,7 @@ def _first(collection: Collection, normal: initialise.Normalised, settings: FitS
         settings.bones,
         settings.seed,
         settings.margin,
+        room,
     )
     model.root_free.copy_(free)
     return model

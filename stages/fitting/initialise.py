@@ -8,6 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.cluster.vq import kmeans2
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from stages.fitting import hull
@@ -77,6 +80,14 @@ def rigid_hull(observations: Observations, poses: Tensor, intrinsics: Tensor, vo
     return Hull(nodes, cube, solid, level)
 
 
+def swept(hull_: Hull, share: float) -> Tensor | None:
+    """Voxel centres (M, 3) seen inside the mask in at least `share` of the frames: the shape and what limbs sweep."""
+    if share >= hull_.level or share <= 0:
+        return None
+    wide = torch.from_numpy(hull.largest_component((hull_.share >= share).numpy()))
+    return hull_.nodes[wide]
+
+
 def place_bones(points: Tensor, count: int, seed: int) -> Bones:
     """Bones among surface points (N, 3): farthest points first, then a few rounds of k-means.
 
@@ -104,14 +115,33 @@ def place_bones(points: Tensor, count: int, seed: int) -> Bones:
     return Bones(centres_t[order], torch.log(0.45 * width)[order, None].expand(count, 3).clone(), parents)
 
 
+def _graph(points: np.ndarray) -> csr_matrix:
+    """Distances between neighbouring points (N, 3) of a surface or solid: the eighth nearest, and a little more."""
+    tree = cKDTree(points)
+    reach = 1.4 * float(np.median(tree.query(points, k=min(9, len(points)))[0][:, -1]))
+    pairs = tree.query_pairs(reach + 1e-9, output_type="ndarray")
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    return csr_matrix((length, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+
+
+def body_of(points: Tensor) -> Tensor:
+    """The largest part of `points` (N, 3) that hangs together; specks that float beside it are left out."""
+    _, part = connected_components(_graph(points.cpu().numpy().astype(np.float64)), directed=False)
+    return points[torch.from_numpy(part == np.bincount(part).argmax())]
+
+
 def _tree_distance(centres: Tensor, points: Tensor) -> Tensor:
-    """Distance (B, B) between bones that counts leaving the body thrice: halfway points far from `points` cost."""
+    """Distance (B, B) between bones along the body: two paws that stand side by side are a long way apart.
+
+    It is the way through neighbouring `points` (N, 3), no shorter than the straight line; where there is none, thrice
+    the straight line.
+    """
     straight = torch.cdist(centres, centres)
-    share = torch.linspace(0.25, 0.75, 3)[:, None, None, None]
-    between = centres[None, :, None] * (1 - share) + centres[None, None] * share
-    some = points[:: max(1, len(points) // 1500)]
-    gap = torch.cdist(between.reshape(-1, 3), some).amin(1).reshape(between.shape[:-1]).amax(0)
-    return straight + 3 * (gap - 0.5 * gap.diagonal()[:, None]).clamp_min(0)
+    some = points[:: max(1, -(-len(points) // 3000))].numpy().astype(np.float64)
+    nearest = cKDTree(some).query(centres.numpy().astype(np.float64))[1]
+    along = dijkstra(_graph(some), directed=False, indices=nearest)[:, nearest]
+    along = np.where(np.isfinite(along), along, 3 * straight.numpy() + 1)
+    return torch.maximum(torch.from_numpy(along).float(), straight)
 
 
 def set_shape(field: GridField, points: Tensor, voxel: float) -> None:
@@ -143,13 +173,18 @@ def build(
     bones: int,
     seed: int,
     margin: float = 0.2,
+    bone_points: Tensor | None = None,
 ) -> Banmo:
-    """A model whose shape is the solid voxels (N, 3), with `bones` bones in it and `margin` around it."""
+    """A model whose shape is the solid voxels (N, 3), with `bones` bones in it and `margin` around it.
+
+    Bones lie among `bone_points` (M, 3) instead, if given: the shape with the room that its limbs sweep.
+    """
     bounds = torch.stack([solid.amin(0) - margin, solid.amax(0) + margin])
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):  # layers draw their first weights from torch's own generator
         torch.manual_seed(seed)
-        model = Banmo(architecture, videos, poses, bounds, place_bones(solid, bones, seed), generator)
+        placed = place_bones(solid if bone_points is None else bone_points, bones, seed)
+        model = Banmo(architecture, videos, poses, bounds, placed, generator)
     if isinstance(model.field, GridField):
         set_shape(model.field, solid, solid_voxel)
     return model

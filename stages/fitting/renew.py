@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stages.fitting.batches import step_generator
-from stages.fitting.initialise import place_bones
+from stages.fitting.initialise import body_of, place_bones
 from stages.model.banmo import Banmo
 from stages.model.fields import GridField
 from stages.model.skeleton import Bones
@@ -51,7 +51,8 @@ def change_bones(model: Banmo, bones: Bones, points: Tensor, seed: int, steps: i
 
 def renew_bones(model: Banmo, seed: int) -> float:
     """Place the bones anew on ``model.surface``; returns what :func:`change_bones` does."""
-    return change_bones(model, place_bones(model.surface, len(model.bones), seed), model.surface, seed)
+    body = body_of(model.surface.cpu())
+    return change_bones(model, place_bones(body, len(model.bones), seed).to(model.surface.device), model.surface, seed)
 
 
 def renew_bounds(model: Banmo, margin: float) -> bool:

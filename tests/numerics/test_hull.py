@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 
-from stages.fitting import hull
+from stages.fitting import hull, initialise
 from stages.fitting.initialise import lattice, normalise, place_bones, rigid_hull, set_shape, usable_frames
 from stages.model.fields import GridField
 from tests.numerics.analytic_scene import Hit, box, ellipsoid, scene, sphere
@@ -167,3 +168,38 @@ def test_bones_reach_the_ends_and_are_seeded() -> None:
     assert torch.isfinite(bones.log_scales).all()
     assert len(place_bones(points[:3], 8, 0)) == 3
     assert len(place_bones(points, 1, 0)) == 1
+
+
+def horseshoe() -> torch.Tensor:
+    """Points of two legs that stand 0.12 apart and meet at the top only."""
+    height = torch.linspace(0, 1, 60)
+    ring = torch.linspace(0, 2 * math.pi, 9)[:-1]
+    circle = 0.03 * torch.stack([ring.cos(), torch.zeros(8), ring.sin()], 1)
+    legs = [circle + torch.tensor([x, float(h), 0.0]) for x in (-0.06, 0.06) for h in height]
+    top = [circle[:, [1, 0, 2]] + torch.tensor([float(x), 1.03, 0.0]) for x in torch.linspace(-0.06, 0.06, 9)]
+    return torch.cat(legs + top)
+
+
+def test_a_tree_of_bones_goes_along_the_body_not_from_paw_to_paw() -> None:
+    bones = initialise.place_bones(horseshoe(), 9, seed=0)
+    centres, parents = bones.centres.detach(), bones.parents.tolist()
+    for bone, parent in enumerate(parents):
+        crosses = centres[bone, 0] * centres[parent, 0] < 0 and abs(float(centres[bone, 0])) > 0.03
+        assert not crosses or float(centres[[bone, parent], 1].min()) > 0.7, (centres[bone], centres[parent])
+    assert float(centres[:, 1].min()) < 0.15
+
+
+def test_specks_are_no_part_of_the_body() -> None:
+    body = horseshoe()
+    speck = torch.randn(12, 3, generator=torch.Generator().manual_seed(0)) * 0.02 + torch.tensor([0.8, 0.5, 0.0])
+    kept = initialise.body_of(torch.cat([speck, body]))
+    assert torch.equal(kept, body)
+
+
+def test_the_room_that_limbs_sweep_is_wider_than_the_hull() -> None:
+    nodes = initialise.lattice(0.1, 0.5)
+    share = 1 - nodes.norm(dim=-1)
+    hull_ = initialise.Hull(nodes, share, share >= 0.7, 0.7)
+    room = initialise.swept(hull_, 0.5)
+    assert room is not None and len(room) > int(hull_.solid.sum()) and float(room.norm(dim=1).max()) <= 0.5 + 1e-6
+    assert initialise.swept(hull_, 0.0) is None and initialise.swept(hull_, 0.7) is None
