@@ -28,6 +28,7 @@ from stages.geometry.raster import rasterise
 from stages.meshing import pictures
 from stages.meshing.skeleton import nearest_rigid
 from stages.model.banmo import Banmo
+from stages.rendering.film import surface_of
 from stages.video_io import read_pictures, write_video
 
 _IOU_FRAMES = 40
@@ -174,7 +175,9 @@ def _write_overlay(
     k = pictures.scaled_intrinsics(intrinsics, clip.width, clip.height, width, height)
     _, parent = player.bones(player.scene(None, np.zeros(1)))
     skin = player.skin_colour(pictures.joint_palette(len(parent)))
-    look = pictures.Look(player.faces, player.colour, skin, parent)
+    drawn = surface_of(player)
+    corner_uv = None if drawn.uv is None else drawn.uv[player.faces]
+    look = pictures.Look(player.faces, player.colour, skin, parent, drawn.texture, corner_uv)
     shown = np.maximum(np.searchsorted(clip.source_idx, np.arange(len(clip.source_time_s)), side="right") - 1, 0)
 
     def draw() -> Iterator[np.ndarray]:
