@@ -20,6 +20,8 @@ SEARCH_EVERY = 4
 """Frames between those that are searched with windows."""
 LEAST_SHRINK = 0.8
 """A refined box is never smaller than this share of the box before: refinement tends to fall onto a part."""
+PART_PRICE = 0.2
+"""What it costs a candidate to lie within a larger one, and brings that one."""
 _BATCH = 16
 
 
@@ -76,12 +78,33 @@ def candidates(frame: np.ndarray, session: PoseNetwork, most: int = 6) -> list[C
         dense = _sigmoid(answer["dense"][:, 0])
         for crop, probability in zip(part, dense, strict=True):
             found += _in_window(probability, crop, height, width)
-    found.sort(key=lambda c: -c.score)
+    found = sorted(_whole_before_part(found), key=lambda c: -c.score)
     kept: list[Candidate] = []
     for c in found:
         if all(overlap(c.box, other.box) < 0.6 for other in kept):
             kept.append(c)
     return kept[:most]
+
+
+def _whole_before_part(found: list[Candidate]) -> list[Candidate]:
+    """A place that holds other finds is a whole, and they are its parts: a close window sees a face as an animal."""
+    boxes = [c.box for c in found]
+    out = []
+    for c in found:
+        holds = any(_inside(b, c.box) > 0.85 and _area(b) < 0.6 * _area(c.box) for b in boxes)
+        held = any(_inside(c.box, b) > 0.85 and _area(c.box) < 0.6 * _area(b) for b in boxes)
+        out.append(Candidate(c.box, c.score + PART_PRICE * (holds - held)))
+    return out
+
+
+def _area(box: np.ndarray) -> float:
+    return float(np.prod(box[2:] - box[:2]))
+
+
+def _inside(part: np.ndarray, whole: np.ndarray) -> float:
+    """Share of a box's area that lies in another box."""
+    shared = np.clip(np.minimum(part[2:], whole[2:]) - np.maximum(part[:2], whole[:2]), 0, None)
+    return float(np.prod(shared)) / max(_area(part), 1e-9)
 
 
 def windows(height: int, width: int) -> list[np.ndarray]:
