@@ -16,6 +16,7 @@ from stages.fitting.observations import Observations
 from stages.fitting.schedule import PhaseSettings
 from stages.fitting.trainer import Trainer
 from stages.model.banmo import Banmo, VideoFacts
+from stages.model.motion import FourierCode
 
 _OF_ONE_VIDEO = (
     "base_poses",
@@ -67,19 +68,23 @@ def driven_model(
     return driven
 
 
-@torch.no_grad()
 def start_codes(driven: Banmo, codes: Tensor, ridge: float = 0.02) -> None:
-    """Set the body code of the one video so that it follows `codes` (T, C) at its kept frames.
+    """Set the body code of the one video so that it follows `codes` (T, C) at its kept frames."""
+    follow(driven.body.code, 0, driven.time, codes, ridge)
+
+
+@torch.no_grad()
+def follow(code: FourierCode, video: int, time: Tensor, wanted: Tensor, ridge: float = 0.02) -> None:
+    """Set a video's code so that it follows `wanted` (T, C) at normalised times (T,).
 
     Ridge regression onto the code's functions of time; high octaves are held back more, so that the start is smooth.
     """
-    code = driven.body.code
-    basis = code.basis(driven.time).double()
+    basis = code.basis(time).double()
     octave = torch.arange(code.octaves, dtype=torch.float64)
     first = torch.tensor([1e-6, 1e-2], dtype=torch.float64)
     price = torch.cat([first, 4.0**octave, 4.0**octave, torch.full((code.splines,), 4.0**code.octaves).double()])
     gram = basis.T @ basis + ridge * torch.diag(price)
-    code.coefficients.copy_(torch.linalg.solve(gram, basis.T @ codes.double())[None].float())
+    code.coefficients[video] = torch.linalg.solve(gram, basis.T @ wanted.double()).float()
 
 
 @dataclass(frozen=True)

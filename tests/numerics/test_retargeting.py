@@ -13,10 +13,11 @@ import torch
 from stages.fitting.observations import ObservationBuilder
 from stages.fitting.surface import surface_points
 from stages.geometry.cameras import transform
-from stages.geometry.rotations import geodesic_angle
+from stages.geometry.rotations import geodesic_angle, so3_exp
 from stages.model.banmo import Banmo, VideoFacts
 from stages.retargeting.articulation import best_sequence, first_articulation, known_shapes, spread
 from stages.retargeting.driven import ClipSettings, ClipTrainer, driven_model, known_codes, start_codes
+from stages.retargeting.growing import change_of_frame, grown
 from stages.retargeting.placing import directions, place_in_box, register, turn_onto
 from tests.numerics.analytic_scene import Scene, ellipsoid, intrinsics_of, model_of, scene, stir
 
@@ -221,3 +222,52 @@ def test_rotations_in_another_frame_are_turned_onto_the_model(known: Banmo) -> N
     placed = turn_onto(shape[None], elsewhere, k, builder.finish(), boxes)
     assert float(torch.rad2deg(geodesic_angle(placed.poses[:, :3, :3], poses[:, :3, :3])).max()) < 12
     assert float((placed.poses[:, 2, 3] - 3).abs().max()) < 0.5
+
+
+# --------------------------------------------------------------------------------------------- clips added later
+
+
+def test_poses_in_another_frame_and_scale_are_carried_over() -> None:
+    generator = torch.Generator().manual_seed(0)
+    old = torch.eye(4).repeat(5, 1, 1)
+    old[:, :3, :3] = so3_exp(torch.randn(5, 3, generator=generator))
+    old[:, :3, 3] = torch.randn(5, 3, generator=generator) + torch.tensor([0.0, 0, 4])
+    turn, shift, scale = so3_exp(torch.randn(1, 3, generator=generator))[0], torch.tensor([0.2, -0.1, 0.3]), 1.7
+    new = old.clone()
+    new[:, :3, :3] = old[:, :3, :3] @ turn.T
+    new[:, :3, 3] = scale * old[:, :3, 3] - (new[:, :3, :3] @ shift)
+    points = torch.randn(6, 3, generator=generator)
+    torch.testing.assert_close(transform(new, scale * points @ turn.T + shift), scale * transform(old, points))
+    found = change_of_frame(new, old)
+    torch.testing.assert_close(found[0], turn, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[1], shift, atol=1e-4, rtol=0)
+    assert found[2] == pytest.approx(scale, abs=1e-4)
+
+
+def test_a_grown_model_keeps_what_it_knew(known: Banmo, seen: Scene) -> None:
+    """A longer clip joins (so time is measured anew); the clips it knew move as before, the new one is placed."""
+    added = VideoFacts("later", tuple(0.1 * i for i in range(9)), 48, 40, (44.0, 44.0), (25.0, 19.0))
+    k = intrinsics_of((48, 40))
+    later = seen.poses[:6][[0, 1, 2, 3, 4, 5, 5, 4, 3]]
+    builder = ObservationBuilder(steps=())
+    for image, mask in zip(seen.images, seen.masks, strict=True):
+        builder.add(0, image, mask, {}, 1.0)
+    for i in (0, 1, 2, 3, 4, 5, 5, 4, 3):
+        builder.add(2, seen.images[i], seen.masks[i], {}, 1.0)
+    turn = so3_exp(torch.tensor([[0.0, 0.4, 0.0]]))[0]
+    elsewhere = torch.cat([seen.poses, later])
+    elsewhere[:, :3, :3] = elsewhere[:, :3, :3] @ turn.T
+    intrinsics = torch.cat([seen.intrinsics, k.expand(9, 3, 3)])
+    new = grown(known, [*seen.videos, added], elsewhere, intrinsics, builder.finish(), octaves=3, splines=6, seed=0)
+    points = known.surface[::20]
+    for video in (0, 1):
+        time = torch.tensor(seen.videos[video].time_s, dtype=torch.float64)
+        before, after = known.forward_warp(points, video, time), new.forward_warp(points, video, time)
+        assert float((before - after).norm(dim=-1).max()) < 5e-3
+        torch.testing.assert_close(new.root_poses(video, time), known.root_poses(video, time), atol=5e-3, rtol=0)
+    torch.testing.assert_close(new.sdf(points), known.sdf(points))
+    placed = new.base_poses[12:]
+    turned = elsewhere[12:, :3, :3].transpose(1, 2) @ placed[:, :3, :3]
+    torch.testing.assert_close(turned, turned[:1].expand_as(turned), atol=1e-5, rtol=0)
+    again = Banmo.restore(new.state_dict(), new.describe())
+    assert again.video_names == ["clip0", "clip1", "later"]
