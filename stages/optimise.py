@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline import BadInput, Folder, Resources, Run, Scene, stage
+from pipeline import BadInput, Folder, InputFile, Resources, Run, Scene, stage
 from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection, collect
@@ -29,10 +29,13 @@ from stages.fitting.schedule import PhaseSettings
 from stages.fitting.team import Team, joined
 from stages.fitting.trainer import Diverged, Trainer
 from stages.model.banmo import Architecture, Banmo
+from stages.retargeting.growing import grown
 
 _CHECKPOINT_STEPS = 50
 _METRIC_STEPS = 10
 _HULL_VOXEL = 0.032
+_NO_MODEL = InputFile("")
+_WARM_BETA = 0.015  # a shape that is known is not blurred again
 
 _CHOICES = {
     "representation": ("grid", "mlp"),
@@ -62,6 +65,8 @@ class FitSettings(PhaseSettings):
     in the first hull."""
     start: str = "hull"
     """hull (soft visual hull of the masks) or sphere (the paper's)."""
+    warm: InputFile = _NO_MODEL
+    """Folder of an earlier model of the same subject to go on from, with clips added; see `banmo extend`."""
     margin: float = 0.3
     """Room for limbs around the first hull (object about 2 long)."""
     renew_at: float = 2.0
@@ -155,6 +160,8 @@ def fit(
         model = Banmo.restore(saved.model_tensors(), saved.description)
     else:
         model = _first(collection, normal, settings, run)
+    if settings.warm:
+        settings = replace(settings, beta_start=min(settings.beta_start, _WARM_BETA), renew_at=2.0)
     _run_phase(model, collection, settings, checkpoints, out, run, "fitting")
 
 
@@ -193,6 +200,19 @@ def refine(
 
 
 def _first(collection: Collection, normal: initialise.Normalised, settings: FitSettings, run: Run) -> Banmo:
+    if settings.warm:
+        model = grown(
+            Banmo.restore(*formats.read_model(Path(settings.warm))),
+            collection.videos,
+            normal.camera_from_canonical,
+            collection.intrinsics,
+            collection.observations,
+            initialise.octaves(collection.videos, settings.motion_period_s),
+            initialise.splines(collection.videos, settings.motion_spacing_s),
+            settings.seed,
+        )
+        model.root_free.copy_(1 - collection.root_fixed)
+        return model
     architecture = Architecture(
         representation=settings.representation,
         voxel=settings.voxel,

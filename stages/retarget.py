@@ -22,11 +22,11 @@ from stages.collect import Collection, collect
 from stages.fitting.observations import ObservationBuilder
 from stages.model.banmo import Banmo
 from stages.model.motion import octaves_for, splines_for
-from stages.networks import NO_FILE
 from stages.retargeting.articulation import first_articulation, known_shapes, spread
 from stages.retargeting.driven import ClipSettings, ClipTrainer, driven_model, known_codes, start_codes
 from stages.retargeting.placing import Placed, register, turn_onto
 
+_NO_FOLDER = InputFile("")
 _KEPT = ("model.safetensors", "model.json")
 _RIG = ("model.glb", "bones.json", "rest.ply")
 _CHECKPOINT_STEPS = 50
@@ -36,9 +36,9 @@ _CHECKPOINT_STEPS = 50
 class KnownSettings:
     """Which model is driven. ``banmo retarget`` fills these in."""
 
-    model: InputFile = NO_FILE
+    model: InputFile = _NO_FOLDER
     """Folder with the fitted model: the result of a workspace's last optimisation phase."""
-    rig: InputFile = NO_FILE
+    rig: InputFile = _NO_FOLDER
     """Folder with its exported files: model.glb, bones.json, rest.ply."""
 
 
