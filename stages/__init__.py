@@ -35,6 +35,7 @@ NAMED_FILES = "stages.registry:find"
 VERBS = {
     "animate": "stages.verbs.animate",
     "evaluate": "stages.verbs.evaluate",
+    "extend": "stages.verbs.extend",
     "render": "stages.verbs.render",
     "retarget": "stages.verbs.retarget",
     "view": "stages.verbs.view",

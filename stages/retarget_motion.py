@@ -21,7 +21,7 @@ import torch
 from pipeline import Folder, Resources, Run, Scene, stage
 from stages import formats
 from stages.animating.adding import NewMotion, add_motion
-from stages.animating.glb import Animation, GlbError, read_glb
+from stages.animating.glb import Animation, Glb, GlbError, read_glb
 from stages.animating.playing import CV_FROM_GL, ROOT_MOTION, Player
 from stages.animating.transfer import local_of, skeleton_of
 from stages.geometry.raster import rasterise
@@ -60,16 +60,18 @@ def motion(
     seconds = torch.from_numpy(times)
     bones = nearest_rigid(driven.bone_transforms(0, seconds).numpy())
     cameras = nearest_rigid(driven.root_poses(0, seconds).numpy())
-    data = add_motion((known / "model.glb").read_bytes(), _motion(known, name, times, bones, cameras))
+    called = driven_name(read_glb((known / "model.glb").read_bytes()), name)
+    data = add_motion((known / "model.glb").read_bytes(), _motion(known, called, times, bones, cameras))
     (out / "model.glb").write_bytes(data)
     intrinsics = driven.intrinsics(0).double().numpy()
     _write_cameras(out, clip, name, intrinsics, cameras)
     glb = read_glb(data)
-    played = glb.animation(name)
+    played = glb.animation(called)
     iou = _agreement(Player.of(glb), played, clip, masks[name], intrinsics, run)
-    _write_overlay(out, Player.of(glb), played, clip, intrinsics, settings.video_side_px, run)
+    _write_overlay(out, name, Player.of(glb), played, clip, intrinsics, settings.video_side_px, run)
     facts = {
         "clip": name,
+        "animation": called,
         "frames": len(times),
         "seconds": round(float(times[-1] - times[0]), 4),
         "iou_mean": None if not len(iou) else round(float(np.mean(iou)), 4),
@@ -83,9 +85,10 @@ def motion(
 def _check(out: Path, frames: dict[str, Folder]) -> None:
     """The GLB is whole and holds the clip."""
     glb = read_glb((out / "model.glb").read_bytes())
+    called = formats.read_json(out / "motion.json")["animation"]
     for name in frames:
-        if len(glb.animation(name).time_s) != len(formats.read_clip(frames[name].path).source_time_s):
-            raise formats.FormatError(f"model.glb: animation {name} has not as many keys as the clip has frames")
+        if len(glb.animation(called).time_s) != len(formats.read_clip(frames[name].path).source_time_s):
+            raise formats.FormatError(f"model.glb: animation {called} has not as many keys as the clip has frames")
 
 
 @motion.sheet
@@ -117,6 +120,12 @@ def _motion(known: Folder, name: str, times: np.ndarray, bones: np.ndarray, came
         moving[glb.names.index(ROOT_MOTION)] = CV_FROM_GL @ cameras
     clock = key_times(times)
     return NewMotion(name, clock, moving, {"start_time_s": float(times[0]), "frames": len(times), "driven": True})
+
+
+def driven_name(glb: Glb, name: str) -> str:
+    """What the new animation is called: like the clip, unless the model has a clip of its own of that name."""
+    own = {a.name for a in glb.animations if not a.extras.get("driven")}
+    return name if name not in own else f"{name} (driven)"
 
 
 def key_times(time_s: np.ndarray) -> np.ndarray:
@@ -168,7 +177,14 @@ def _agreement(
 
 
 def _write_overlay(
-    out: Path, player: Player, played: Animation, clip: formats.Clip, intrinsics: np.ndarray, side_px: int, run: Run
+    out: Path,
+    name: str,
+    player: Player,
+    played: Animation,
+    clip: formats.Clip,
+    intrinsics: np.ndarray,
+    side_px: int,
+    run: Run,
 ) -> None:
     """``overlay-<clip>.mp4``: each source frame, the model over it, its joints."""
     width, height, _ = pictures.scaled_size(clip.width, clip.height, side_px)
@@ -187,5 +203,5 @@ def _write_overlay(
             points, joints = _before_camera(player, played, key)
             yield pictures.overlay(look, points, np.stack([joints, joints], axis=1), k, frame)
 
-    pictured = run.progress(draw(), len(clip.source_time_s), f"overlay {played.name}")
-    write_video(out / f"overlay-{played.name}.mp4", pictured, clip.source_time_s)
+    pictured = run.progress(draw(), len(clip.source_time_s), f"overlay {name}")
+    write_video(out / f"overlay-{name}.mp4", pictured, clip.source_time_s)

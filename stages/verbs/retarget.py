@@ -7,12 +7,11 @@ call does nothing, an interrupted one goes on, and every stage can be looked at.
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 from pipeline import BadInput, Results
+from stages.again import run_pipeline
 
 SUMMARY = "drive the model by another clip: its motion becomes one more animation"
 EXAMPLES = (
@@ -49,18 +48,15 @@ def run(args: argparse.Namespace, results: Results) -> int:
         raise BadInput("there is no such clip", where=clip)
     fitted, rig = _fitted(results), results.folder("export")
     target = (args.to or results.workspace / "retarget" / clip.stem).absolute()
-    command = [sys.executable, "-P", "-m", "pipeline.cli", "run", str(clip)]
-    command += ["--workspace", str(target), "--definition", "stages.retargeting"]
-    command += [f"--known.model={fitted}", f"--known.rig={rig.path}"]
-    command += ["--preset", args.preset] if args.preset else []
-    command += ["--track.same_subject=true"] if args.same_subject else []
-    command += [f"--{name}={text}" for name, text in args.overrides]
-    root = str(Path(__file__).resolve().parents[2])
-    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    child = subprocess.run(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)})
-    if child.returncode == 0:
+    words = [str(clip), "--workspace", str(target), "--definition", "stages.retargeting"]
+    words += [f"--known.model={fitted}", f"--known.rig={rig.path}"]
+    words += ["--preset", args.preset] if args.preset else []
+    words += ["--track.same_subject=true"] if args.same_subject else []
+    words += [f"--{name}={text}" for name, text in args.overrides]
+    code = run_pipeline(words)
+    if code == 0:
         sys.stdout.write(f"{target / 'exports' / 'model.glb'}: the model with the motion of {clip.name} added\n")
-    return child.returncode
+    return code
 
 
 def _fitted(results: Results) -> Path:

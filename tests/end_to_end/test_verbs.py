@@ -13,7 +13,7 @@ from PIL import Image
 from stages.animating.glb import read_glb
 from stages.animating.playing import Player
 from synthetic.clips import write_clips
-from tests.end_to_end.conftest import Outcome, run_banmo
+from tests.end_to_end.conftest import TINY, Outcome, run_banmo
 
 Finished = tuple[Path, Outcome]
 
@@ -111,7 +111,6 @@ def test_retarget_a_clip_and_then_nothing(made: Path, tmp_path: Path) -> None:
     drive = tmp_path / "drive"
     drive.mkdir()
     write_clips(drive, clips=1, frames=7, size=72, seed=11, truth=True)
-    clip = next(drive.glob("*.mp4"))
     clip = next(p for p in drive.glob("*.mp4") if ".masks" not in p.name)
     words = ("retarget", "--model", made, "--video", clip, "--track.iterations=6", "--track.frames_per_step=4",
              "--track.pixels_per_frame=24", "--track.probe_samples=16", "--track.fine_samples=4")  # fmt: skip
@@ -120,13 +119,39 @@ def test_retarget_a_clip_and_then_nothing(made: Path, tmp_path: Path) -> None:
     exports = made / "retarget" / clip.stem / "exports"
     assert str(exports / "model.glb") in done.out
     glb = read_glb((exports / "model.glb").read_bytes())
-    assert len(glb.animations) == 3 and len(glb.animation(clip.stem).time_s) == 7
+    assert [a.name for a in glb.animations] == ["cat-00", "cat-01", "cat-00 (driven)"], "a clip of that name stays"
+    assert len(glb.animation("cat-00 (driven)").time_s) == 7
     before = read_glb((made / "exports" / "model.glb").read_bytes())
     np.testing.assert_array_equal(glb.attribute("POSITION"), before.attribute("POSITION"))
     assert len(frames_of(exports / f"overlay-{clip.stem}.mp4")) == 7
     assert json.loads((exports / "motion.json").read_text())["iou_mean"] > 0.1
     again = run_banmo(*words)
     assert again.code == 0 and "up to date" in again.out, again.text
+
+
+def test_a_clip_that_is_added_joins_the_model(copy_of_finished: Path, clips: Path, tmp_path: Path) -> None:
+    """Only what is new is computed; the fit goes on from the model that was there."""
+    import shutil
+
+    more = tmp_path / "more"
+    shutil.copytree(clips, more)
+    for path in more.iterdir():
+        path.chmod(0o644)
+    extra = tmp_path / "extra"
+    write_clips(extra, clips=3, frames=8, size=72, seed=3, truth=True)
+    for path in extra.glob("cat-02*"):
+        shutil.copyfile(path, more / path.name)
+    steps = ("--fit.iterations=8", "--correct.iterations=4", "--refine.iterations=4")
+    done = run_banmo("extend", more, "--workspace", copy_of_finished, *TINY, *steps)
+    assert done.code == 0, done.text
+    assert "masks/cat-02: done" in done.out and "masks/cat-00: done" not in done.out
+    glb = read_glb((copy_of_finished / "exports" / "model.glb").read_bytes())
+    assert [a.name for a in glb.animations] == ["cat-00", "cat-01", "cat-02"]
+    kept = next((copy_of_finished / "earlier").iterdir())
+    before = json.loads((kept / "model.json").read_text())
+    after = json.loads((copy_of_finished / "latest" / "fit" / "model.json").read_text())
+    assert before["bones"] == after["bones"] and before["bounds"] == after["bounds"], "the same bones in the same box"
+    assert f'warm = "earlier/{kept.name}"' in done.out
 
 
 @pytest.mark.parametrize(
@@ -153,7 +178,7 @@ def test_what_cannot_be_done_is_said_in_a_sentence(
     assert said in done.err and "Traceback" not in done.err and len(done.err.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize("verb", ["render", "retarget", "animate"])
+@pytest.mark.parametrize("verb", ["render", "retarget", "animate", "extend", "view"])
 def test_every_command_explains_itself(made: Path, verb: str) -> None:
     done = run_banmo(verb, "--help", "--workspace", made)
     assert done.code == 0 and f"banmo {verb} " in done.out and "examples:" in done.out
