@@ -23,6 +23,10 @@ TURN_SIGMA = 0.06
 TILT_SIGMA = np.radians(1.0)
 """Change of elevation and roll from frame to frame, radians."""
 AGREEMENT = np.pi / 4
+CHANCE = 0.25
+"""What single frames say, on average, for views within AGREEMENT of a path that has nothing to do with them."""
+TELLING = 0.2
+"""Excess over chance at which a clip as a whole is well supported; its frames are many."""
 
 
 def seen(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
@@ -60,7 +64,8 @@ def _answer(subject: Subject, view: ViewBelief) -> Answer:
     azimuth, elevation, roll, sharp = view_path(subject, view)
     away = np.angle(np.exp(1j * (view.azimuth_bins[None] - azimuth[:, None])))
     near = (np.exp(view.azimuth) * (np.abs(away) < AGREEMENT)).sum(axis=1)  # what the frame alone says of the path
-    trust = float(np.clip(near[subject.cues.known].mean(), 0.0, 1.0)) if subject.cues.known.any() else 0.0
+    agreed = float(near[subject.cues.known].mean()) if subject.cues.known.any() else 0.0
+    trust = 1.0 - float(np.exp(-max(agreed - CHANCE, 0.0) / TELLING))
     return Answer(
         "network",
         view_rotation(azimuth, elevation, roll),
@@ -68,5 +73,5 @@ def _answer(subject: Subject, view: ViewBelief) -> Answer:
         subject.cues.centre_px,
         trust * sharp * np.where(subject.cues.cut, 0.5, 1.0),
         trust,
-        {"frames_that_agree": round(trust, 3)},
+        {"agreed": round(agreed, 3)},
     )

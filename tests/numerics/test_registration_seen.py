@@ -76,7 +76,8 @@ def test_trust_is_what_single_frames_say_of_the_path() -> None:
     azimuth = np.radians(np.linspace(20, 130, 60))
     sure = seen([_subject(azimuth, np.zeros(60, bool))], 0, lambda *_: None)["clip"]
     torn = seen([_subject(azimuth, np.arange(60) % 5 < 2)], 0, lambda *_: None)["clip"]
-    assert sure.trust > 0.85 and 0.4 < torn.trust < 0.7
+    assert sure.trust > 0.95 and 0.7 < torn.trust < 0.95
+    assert sure.score["agreed"] > 0.85 and 0.4 < torn.score["agreed"] < 0.7
     angles = view_angles(sure.rotation)
     assert np.degrees(np.abs(np.angle(np.exp(1j * (angles[0] - azimuth))))).max() < 12
 
