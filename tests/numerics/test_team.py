@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from pipeline import BadInput, Interrupted, Run
-from stages import optimise
+from stages import phases
 from stages.checkpoint import Checkpoints
 from stages.fitting.batches import Draws, draw, step_generator
 from stages.fitting.team import ALONE, Team, joined
@@ -49,10 +49,10 @@ def phase(rank: int, size: int, folder: Path, stop_at: int | None) -> str:
     saved = checkpoints.latest()
     model = first_model() if saved is None else Banmo.restore(saved.model_tensors(), saved.description)
     written: list[int] = []
-    optimise._write_folder = lambda *_: written.append(rank)  # type: ignore[assignment]
+    phases._write_folder = lambda *_: written.append(rank)  # type: ignore[assignment]
     collection: Any = type("Collection", (), {"observations": seen.observations})
     try:
-        optimise._run_phase(model, collection, SETTINGS, checkpoints, folder, run, "fitting")
+        phases.run_phase(model, collection, SETTINGS, checkpoints, folder, run, "fitting")
     except Interrupted:
         return "stopped"
     return f"wrote {len(written)}"
@@ -77,7 +77,7 @@ def member(rank: int, size: int, ports: list[int], folder: str) -> None:
     """One process of the team: trains, then runs a phase that is stopped and continued; keeps what it saw."""
     meet(ports[0])
     torch.set_num_threads(1)
-    optimise._write_preview = lambda *_: None  # type: ignore[assignment]
+    phases._write_preview = lambda *_: None  # type: ignore[assignment]
     with joined(rank, size, "cpu", PATIENCE_S) as team:
         values, state = train(team)
         mixed = [float(rank), 1.0]
@@ -168,7 +168,7 @@ def test_more_processes_than_frames_are_refused(tmp_path: Path) -> None:
     run = Run(checkpoint_dir=tmp_path, rank=0, world_size=9)
     collection: Any = None
     with pytest.raises(BadInput, match="9 processes for 5 frames"):
-        optimise._run_phase(first_model(), collection, SETTINGS, Checkpoints(tmp_path), tmp_path, run, "fitting")
+        phases.run_phase(first_model(), collection, SETTINGS, Checkpoints(tmp_path), tmp_path, run, "fitting")
 
 
 def test_a_team_diverges_together() -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pipeline import BadInput, Interrupted, Run
-from stages import formats, optimise
+from stages import formats, optimise, phases
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection
 from stages.fitting import trainer as training
@@ -60,8 +60,8 @@ def collection(tmp_path_factory: pytest.TempPathFactory) -> Collection:
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(optimise, "_CHECKPOINT_STEPS", 3)
-    monkeypatch.setattr(optimise, "_METRIC_STEPS", 2)
+    monkeypatch.setattr(phases, "_CHECKPOINT_STEPS", 3)
+    monkeypatch.setattr(phases, "_METRIC_STEPS", 2)
 
 
 def first_model() -> Banmo:
@@ -76,7 +76,7 @@ def work(collection: Collection, out: Path, run: Run) -> None:
     checkpoints = Checkpoints(run.checkpoint_dir)
     saved = checkpoints.latest()
     model = first_model() if saved is None else Banmo.restore(saved.model_tensors(), saved.description)
-    optimise._run_phase(model, collection, SETTINGS, checkpoints, out, run, "fitting")
+    phases.run_phase(model, collection, SETTINGS, checkpoints, out, run, "fitting")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -86,12 +86,12 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def undisturbed(collection: Collection, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     root = tmp_path_factory.mktemp("straight")
-    before = optimise._METRIC_STEPS
-    optimise._METRIC_STEPS = 2
+    before = phases._METRIC_STEPS
+    phases._METRIC_STEPS = 2
     try:
         work(collection, root / "out", Run(checkpoint_dir=root / "points"))
     finally:
-        optimise._METRIC_STEPS = before
+        phases._METRIC_STEPS = before
     return contents(root / "out")
 
 
@@ -133,7 +133,7 @@ def test_a_killed_phase_ends_as_an_undisturbed_one(
     with pytest.raises(RuntimeError, match="killed"):
         work(collection, tmp_path / "out0", Run(checkpoint_dir=tmp_path / "points"))
     monkeypatch.undo()
-    monkeypatch.setattr(optimise, "_METRIC_STEPS", 2)
+    monkeypatch.setattr(phases, "_METRIC_STEPS", 2)
     latest = Checkpoints(tmp_path / "points").latest()
     assert latest is not None and latest.step == 3
     work(collection, tmp_path / "out", Run(checkpoint_dir=tmp_path / "points"))
@@ -186,20 +186,18 @@ def test_a_phase_given_minutes_lays_its_schedule_over_the_steps_they_buy(
     collection: Collection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bought = iter([6, 99])
-    monkeypatch.setattr(optimise, "affordable_steps", lambda *_: next(bought))
+    monkeypatch.setattr(phases, "affordable_steps", lambda *_: next(bought))
     settings = tiny_settings(iterations=500, pixels_per_frame=12, minutes=2.0)
     checkpoints = Checkpoints(tmp_path / "points")
     run = StopsAfter(3, tmp_path / "points")
     with pytest.raises(Interrupted):
-        optimise._run_phase(first_model(), collection, settings, checkpoints, tmp_path / "out", run, "fitting")
+        phases.run_phase(first_model(), collection, settings, checkpoints, tmp_path / "out", run, "fitting")
     saved = checkpoints.latest()
     assert saved is not None and saved.step == 3
     model = Banmo.restore(saved.model_tensors(), saved.description)
     out = tmp_path / "out"
     out.mkdir()
-    optimise._run_phase(
-        model, collection, settings, checkpoints, out, Run(checkpoint_dir=tmp_path / "points"), "fitting"
-    )
+    phases.run_phase(model, collection, settings, checkpoints, out, Run(checkpoint_dir=tmp_path / "points"), "fitting")
     last = json.loads((out / "metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 6  # what was bought at the start holds after a stop
 
@@ -208,8 +206,8 @@ def test_refinement_tells_how_each_frame_fits(collection: Collection, tmp_path: 
     small = {"frames_per_step": 4, "pixels_per_frame": 12, "probe_samples": 16, "fine_samples": 8}
     settings = optimise.RefineSettings(iterations=1, **small)
     run = Run(checkpoint_dir=tmp_path / "points")
-    optimise._run_phase(
-        first_model(), collection, settings, Checkpoints(tmp_path / "points"), tmp_path, run, "refining"
+    phases.run_phase(
+        first_model(), collection, settings, Checkpoints(tmp_path / "points"), tmp_path, run, "refining", diagnose=True
     )
     told = json.loads((tmp_path / "diagnosis.json").read_text())["videos"]
     assert set(told) == {"clip0", "clip1"}
