@@ -151,7 +151,7 @@ def _rest_shape(tensors: dict[str, object], description: dict[str, object], reso
     points = torch.from_numpy(vertices.astype(np.float32)) + low
     centres, parents = model.bone_centres.numpy(), model.bone_parents.numpy()
     bones = np.array([[centres[p], centres[b]] for b, p in enumerate(parents.tolist()) if p != b]).reshape(-1, 2, 3)
-    return Shown(points.numpy(), faces[:, ::-1].copy(), to_bytes(model.colour(points).numpy()), bones)
+    return Shown(points.numpy(), faces.astype(np.int64), to_bytes(model.colour(points).numpy()), bones)
 
 
 def normal_colours(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
