@@ -73,6 +73,15 @@ def canonical(value: Any) -> str:
     return json.dumps(normal(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
+def key_of_stored(text: dict[str, Any]) -> str:
+    """Key of a text that was read back from JSON: it was brought into normal form before it was written."""
+    return _key(json.dumps(text, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False))
+
+
 def key_of(text: dict[str, Any]) -> str:
     """Key of an action's text."""
-    return hashlib.sha256(_TAG + canonical(text).encode()).hexdigest()
+    return _key(canonical(text))
+
+
+def _key(canonical_text: str) -> str:
+    return hashlib.sha256(_TAG + canonical_text.encode()).hexdigest()

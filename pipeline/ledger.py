@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.action import key_of
+from pipeline.action import key_of_stored
 from pipeline.files import failpoint, read_json, write_json
 
 FORMAT = 1
@@ -51,14 +51,14 @@ class Ledger:
     """Reads and writes records."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root
+        self.root, self._root = root, str(root)
         self._cache: dict[str, list[Record]] = {}
         self._by_video: dict[str, dict[str | None, list[Record]]] = {}
         self._by_input: dict[str, dict[str, list[int]]] = {}
 
     def path(self, stage: str, key: str) -> Path:
         """Where the record of this key lies."""
-        return self.root / stage / f"{key}.json"
+        return Path(f"{self._root}/{stage}/{key}.json")
 
     def find(self, stage: str, key: str) -> Record | None:
         """The record of this key, or None."""
@@ -95,6 +95,8 @@ class Ledger:
     def reading(self, stage: str, digests: set[str]) -> list[Record]:
         """The valid records of a stage that read one of these digests for a video, newest first."""
         records = self.all(stage)
+        if not records:
+            return []
         if stage not in self._by_input:
             found: dict[str, list[int]] = {}
             for i, record in enumerate(records):
@@ -121,7 +123,7 @@ def parse(value: Any, stage: str, key: str) -> Record | None:
         return None
     try:
         record = Record(**value)
-        if not (isinstance(record.action, dict) and key_of(record.action) == key == record.key):
+        if not (isinstance(record.action, dict) and key_of_stored(record.action) == key == record.key):
             return None
     except (TypeError, ValueError, RecursionError):
         return None

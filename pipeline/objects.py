@@ -250,14 +250,23 @@ class Objects:
             write_memo(self._memo(kind, digest), {"signature": signature})
 
     def _signature(self, kind: str, digest: str) -> str | None:
-        folder = self.path(kind, digest)
+        """Names, sizes and times of everything in a folder, hashed; asked of every result by every command."""
+        root = os.fspath(self.path(kind, digest))
+        lines: list[str] = []
+        waiting = [("", root)]
         try:
-            if folder.is_symlink():
+            if os.path.islink(root):
                 return None
-            lines = [
-                f"{name}\0{s.st_mode & 0o170000}\0{s.st_size}\0{s.st_mtime_ns}\0{s.st_ctime_ns}"
-                for name, _, s in walk(folder)
-            ]
+            while waiting:
+                prefix, current = waiting.pop()
+                with os.scandir(current) as entries:
+                    for entry in entries:
+                        s = entry.stat(follow_symlinks=False)
+                        if stat.S_ISDIR(s.st_mode):
+                            waiting.append((f"{prefix}{entry.name}/", entry.path))
+                        else:
+                            kept = f"{s.st_mode & 0o170000}\0{s.st_size}\0{s.st_mtime_ns}\0{s.st_ctime_ns}"
+                            lines.append(f"{prefix}{entry.name}\0{kept}")
         except OSError:
             return None
         lines.sort()
@@ -273,8 +282,10 @@ def _drop_empty_folders(folder: Path) -> None:
 
 def _make_read_only(folder: Path) -> None:
     """Files and inner folders become read-only; the folder itself only after the rename."""
-    for current, _, names in os.walk(folder):
-        for name in names:
-            os.chmod(os.path.join(current, name), 0o444)
-        if Path(current) != folder:
-            os.chmod(current, 0o555)
+    waiting = [os.fspath(folder)]
+    while waiting:
+        with os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+                os.chmod(entry.path, 0o555 if entry.is_dir(follow_symlinks=False) else 0o444)

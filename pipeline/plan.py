@@ -46,6 +46,8 @@ class Planner:
         self.results: dict[str, Record] = {}
         """Label -> the record that stands for this node now."""
         self.steps: dict[str, Step] = {}
+        self._texts: dict[str, dict[str, Any]] = {}
+        self._salt = settings.pipeline.salt
 
     def plan(self, nodes: list[Node]) -> list[Step]:
         """Decide every node as far as it can be decided now."""
@@ -90,13 +92,23 @@ class Planner:
             code=info.code.digest,
             settings=self._settings_for_key(node),
             inputs=self._inputs(node, {}),
-            salt=self.settings.pipeline.salt,
+            salt=self._salt,
         )
 
     def _settings_for_key(self, node: Node) -> dict[str, Any]:
+        known = self._texts.get(node.info.name)
+        if known is not None:
+            return known
         kinds = {f["name"]: f["type"] for f in node.info.fields}
         values = stage_values(self.settings, node.info)
-        return {key: self._by_content(kinds[key], value) for key, value in values.items()}
+        found = {key: self._by_content(kinds[key], value) for key, value in values.items()}
+        if not any(self._names_files(kind) for kind in kinds.values()):
+            self._texts[node.info.name] = found  # the same for every video, and nothing on disk can change it
+        return found
+
+    def _names_files(self, kind: dict[str, Any]) -> bool:
+        inner = [kind["item"]] if "item" in kind else kind.get("items", [])
+        return kind["kind"] == "file" or any(self._names_files(k) for k in inner)
 
     def _by_content(self, kind: dict[str, Any], value: Any) -> Any:
         """A setting with the paths of files replaced by the digests of their content."""
@@ -155,7 +167,7 @@ class Planner:
             code=info.code.digest,
             settings=self._settings_for_key(node),
             inputs=self._inputs(node, {label: f"of {label}" for label in self._missing(node)}),
-            salt=self.settings.pipeline.salt,
+            salt=self._salt,
         ).text
         earlier = nearest(text, self.workspace.ledger, info.name, node.video_name)
         if earlier is None:

@@ -95,7 +95,7 @@ def nearest(text: dict[str, Any], ledger: Ledger, stage: str, video: str | None)
     A video that was renamed finds its records by what they read.
     """
     mine = ledger.of_video(stage, video)
-    if not mine and video is not None:
+    if not mine and video is not None and ledger.all(stage):
         digests = {d for d in _flat(text.get("inputs", {})).values() if isinstance(d, str)}
         mine = ledger.reading(stage, digests)
     return min(mine, key=lambda r: len(_differences(text, r.action)), default=None)

@@ -164,7 +164,7 @@ def test_ctrl_c_cancels_and_the_next_run_goes_on(lab: Lab, cluster: Cluster, alo
     wait_for(lambda: not cluster.command("squeue", "-h").strip(), PATIENCE_S)
     reached = steps_done(lab)
     assert not list((lab.workspace / "jobs").iterdir())
-    assert lab.run("--train.steps", "40").code == 0, "on this machine, in one process"
+    assert lab.run(*SLOW).code == 0, "on this machine, in one process"
     assert starts(lab)[-1] == reached >= 3
     assert losses(lab) == pytest.approx(alone, rel=1e-9)
 
