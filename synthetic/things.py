@@ -39,10 +39,8 @@ def thing(rng: np.random.Generator, cells: int = 56) -> Body:
         if kind == "lump" or (kind == "mixed" and rng.random() < 0.5):
             tip = at + rng.normal(0, 0.3, 3)
             axis = rng.normal(size=3) if rng.random() < 0.4 else None
-            cones.append(
-                Cone("thing", at, tip, *rng.uniform(0.06, 0.3, 2), float(rng.uniform(0.01, 0.1)), axis,
-                     float(rng.uniform(0.4, 1)))
-            )  # fmt: skip
+            ra, rb, blend = (float(v) for v in rng.uniform([0.06, 0.06, 0.01], [0.3, 0.3, 0.1]))
+            cones.append(Cone("thing", at, tip, ra, rb, blend, axis, float(rng.uniform(0.4, 1))))
             at = at + rng.normal(0, 0.25, 3)
         else:
             half = rng.uniform(0.05, 0.4, 3)

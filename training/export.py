@@ -16,7 +16,7 @@ import json
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import onnx
@@ -42,7 +42,7 @@ class _Graph:
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     weights: list[onnx.TensorProto] = field(default_factory=list)
 
-    def op(self, kind: str, *inputs: str, **attributes: object) -> str:
+    def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """Add a node; returns the name of its output."""
         name = f"{kind.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [name], name=name, **attributes))
@@ -64,7 +64,7 @@ class _Graph:
         kernel = conv.weight
         bias = torch.zeros(conv.out_channels) if conv.bias is None else conv.bias
         if norm is not None:
-            scale = norm.weight / (norm.running_var + norm.eps).sqrt()  # type: ignore[operator]
+            scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)  # type: ignore[operator, arg-type]
             kernel = kernel * scale[:, None, None, None]
             bias = norm.bias + (bias - norm.running_mean) * scale  # type: ignore[operator]
         pad = [conv.padding[0], conv.padding[1]] * 2  # type: ignore[index]
@@ -78,7 +78,8 @@ class _Graph:
             while parts:
                 part = parts.pop(0)
                 if isinstance(part, nn.Conv2d):
-                    norm = parts.pop(0) if parts and isinstance(parts[0], nn.BatchNorm2d) else None
+                    norm = parts[0] if parts and isinstance(parts[0], nn.BatchNorm2d) else None
+                    parts = parts[1:] if norm is not None else parts
                     x = self.convolve(x, part, norm)
                 else:
                     x = self.layer(x, part)
@@ -131,17 +132,13 @@ def _halve(g: _Graph, x: str) -> str:
 
 def _dense(g: _Graph, network: Network, parts: dict[str, str], category: int) -> str:
     """17 channels at half the size: mask logit, unit embedding."""
-    mask = nn.Conv2d(network.mask.in_channels, 1, 1)
-    mask.weight.data, mask.bias.data = (
-        network.mask.weight[category : category + 1],
-        network.mask.bias[category : category + 1],
-    )  # type: ignore[index, union-attr]
-    logit = g.convolve(parts["fine2"], mask)
+    every = g.convolve(parts["fine2"], network.mask)
+    logit = g.op("Gather", every, g.constant(np.array([category], np.int64)), axis=1)
     embedding = g.lift(g.unit(g.layer(parts["fine4"], network.embedding[category])), 2, "linear")
     return g.op("Concat", logit, g.unit(embedding), axis=1)
 
 
-def _finish(g: _Graph, inputs: list[onnx.ValueInfoProto], outputs: dict[str, tuple[str, list[object]]], name: str,
+def _finish(g: _Graph, inputs: list[onnx.ValueInfoProto], outputs: dict[str, tuple[str, list[Any]]], name: str,
             provenance: dict[str, str]) -> onnx.ModelProto:  # fmt: skip
     infos = []
     for public, (source, shape) in outputs.items():
@@ -176,7 +173,7 @@ def posenet_model(network: Network, category: int, provenance: dict[str, str]) -
     x = g.op("Relu", g.layer(g.op("Flatten", x, axis=1), head.hidden))  # type: ignore[arg-type]
     view = g.layer(x, head.logits)  # type: ignore[arg-type]
     kind = g.layer(g.op("Flatten", g.op("GlobalAveragePool", parts["at16"]), axis=1), network.category)
-    outputs: dict[str, tuple[str, list[object]]] = {
+    outputs: dict[str, tuple[str, list[Any]]] = {
         "view": (view, ["n", VIEW_OUTPUTS]),
         "dense": (_dense(g, network, parts, category), ["n", 1 + EMBEDDING, side // 2, side // 2]),
         "category": (kind, ["n", len(CATEGORIES) + 1]),

@@ -27,6 +27,9 @@ NEAR = 0.09
 class Surface(nn.Module):
     """The canonical surface's embedding: unit vectors, a learnt mixture of its Laplace-Beltrami eigenfunctions."""
 
+    basis: Tensor
+    target: Tensor
+
     def __init__(self, vertices: np.ndarray, basis: np.ndarray, seed: int) -> None:
         super().__init__()
         self.register_buffer("basis", torch.from_numpy(basis).float())

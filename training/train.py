@@ -12,6 +12,7 @@ import copy
 import json
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -53,7 +54,7 @@ def make_surface(category: str, seed: int) -> Surface:
 
 def step_losses(
     network: Network,
-    surfaces: nn.ModuleList,
+    surfaces: Sequence[Surface],
     banks: list[Bank],
     things: Bank,
     photos: Tensor,
@@ -122,8 +123,10 @@ def train(
     torch.manual_seed(seed)
     out.mkdir(parents=True, exist_ok=True)
     draw = Random(seed)
-    network = Network().to(memory_format=torch.channels_last)
-    surfaces = nn.ModuleList(make_surface(name, seed + k) for k, name in enumerate(CATEGORIES))
+    network = Network()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    places = [make_surface(name, seed + k) for k, name in enumerate(CATEGORIES)]
+    surfaces = nn.ModuleList(places)
     if start is not None:
         state = torch.load(start, weights_only=True)
         network.load_state_dict(state["network"])
@@ -144,7 +147,7 @@ def train(
                 group["lr"] = rate * min(1.0, (step + 1) / 200) * _fall(share)
             network.train()
             loss, figures = step_losses(
-                network, surfaces, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
+                network, places, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
             )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
