@@ -66,7 +66,7 @@ class ExportSettings:
     influences: int = 8
     """Bones that move a vertex at most; many viewers use the first four."""
     texture_px: int = 1024
-    """Side of the texture, coloured from the frames; 0 leaves vertex colours only."""
+    """Side of the texture at most (less where the videos show no more); 0 leaves vertex colours only."""
     frame_meshes: bool = True
     """Write a mesh for every frame of every video."""
     frame_mesh_faces: int = 4000

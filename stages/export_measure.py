@@ -12,14 +12,16 @@ from stages.meshing import atlas, pictures, quality
 from stages.meshing.rig import Animatable, PosedClip, Rig, field_colour
 
 _QUALITY_SIDE_PX = 256
-_BAKED_FRAMES = 60  # of all videos together
-_CANDIDATES = 3  # frames looked at for each one baked: the sharpest of them is taken
+_BAKED_FRAMES = 120  # of all videos together
+_CANDIDATES = 2  # frames looked at for each one baked: the sharpest of them is taken
 
 
 def bake(
-    model: Animatable, rig: Rig, inputs: list[ExportedVideo], clips: list[PosedClip], size_px: int, run: Run
+    model: Animatable, rig: Rig, inputs: list[ExportedVideo], clips: list[PosedClip], most_px: int, run: Run
 ) -> Texture:
-    """Colour the texture from the sharpest of frames spread over all videos."""
+    """Colour the texture from the sharpest of frames spread over all videos; its side is `most_px` at most."""
+    areas = [float(np.quantile(v.facts.area, 0.9)) * v.clip.width * v.clip.height for v in inputs]
+    size_px = atlas.fitting_side_px(max(areas), most_px)
     charts = atlas.unwrap(rig.mesh, size_px)
     texels = atlas.texels_of(charts, size_px)
     points = texels.spread(rig.mesh.faces, rig.mesh.vertices)
@@ -69,6 +71,7 @@ def measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray,
     intrinsics = pictures.scaled_intrinsics(posed.intrinsics, clip.width, clip.height, width, height)
     slack = 0.02 * rig.mesh.length
     iou, missing, extra = np.full((3, len(clip)), np.nan)
+    area = np.zeros(len(clip))
     for i, source in enumerate(run.progress(clip.source_idx, label=f"quality {video.name}")):
         if "missing" in video.facts.flags[i]:
             continue
@@ -78,6 +81,7 @@ def measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray,
         mask = video.mask(i, width, height)
         if not mask.any():
             continue
+        area[i] = float(mask.sum())
         iou[i] = quality.mask_iou(fragments.covered, mask)
         missing[i], extra[i] = quality.mask_misfit(fragments.covered, mask)
         normals = vertex_normals(points, rig.mesh.faces)
@@ -94,4 +98,5 @@ def measure(video: ExportedVideo, rig: Rig, posed: PosedClip, views: np.ndarray,
         len(clip.source_time_s),
         posed.skinning_error[8],
         posed.skinning_error[4],
+        area,
     )

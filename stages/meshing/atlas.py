@@ -12,6 +12,8 @@ from stages.geometry.raster import Fragments, face_normals, project, rasterise
 from stages.meshing.surface import Mesh
 
 _FIELD_WEIGHT = 0.02  # of the model's own colour beside what the frames say; a frontal, sharp sample weighs 1
+_FRONTAL = 2.0  # power of the cosine of the angle of view: how much the most frontal views dominate
+_LIGHT = 1.2  # how much brighter one side of an object may be than its mean
 _OUTLIER = 0.4  # a sample that differs so much from the model's colour is taken for background or an occluder
 
 
@@ -31,6 +33,16 @@ class Atlas:
     def corner_uv(self) -> np.ndarray:
         """(F, 3, 2) coordinates of each corner."""
         return self.uv[self.faces]
+
+
+def fitting_side_px(silhouette_px: float, most_px: int) -> int:
+    """Side of a texture that holds what pictures show whose silhouette covers `silhouette_px` pixels: a power of two.
+
+    The surface has about four times the area of its silhouette (exactly so for the mean of a convex one), charts fill
+    some 60 % of the picture, and one and a half texels a pixel lose nothing.
+    """
+    needed = 1.5 * np.sqrt(4 * silhouette_px / 0.6)
+    return int(min(most_px, 2 ** np.ceil(np.log2(max(needed, 64.0)))))
 
 
 def unwrap(mesh: Mesh, size_px: int) -> Atlas:
@@ -104,7 +116,7 @@ class Baker:
         area = np.linalg.norm(normal, axis=1)
         facing = -(normal * centre).sum(axis=1) / np.maximum(area * np.linalg.norm(centre, axis=1), 1e-12)
         pixels_per_unit = intrinsics[0, 0] / np.maximum(centre[:, 2], 1e-3)
-        face_weight = np.clip((facing - 0.2) / 0.8, 0, 1) ** 4 * (pixels_per_unit / intrinsics[0, 0] * 3) ** 2
+        face_weight = np.clip((facing - 0.2) / 0.8, 0, 1) ** _FRONTAL * (pixels_per_unit / intrinsics[0, 0] * 3) ** 2
         candidate = np.flatnonzero(face_weight[self._texels.face] > 1e-3)
         corner = vertices_camera[faces[self._texels.face[candidate]]]
         point = np.einsum("pk,pkc->pc", self._texels.weight[candidate], corner)
@@ -128,11 +140,15 @@ class Baker:
     def end_clip(self) -> None:
         """Merge what was added since the last call: frames of one video, in one light.
 
-        Exposure and light differ from clip to clip, so the clip's mean colour is brought to the model's own, channel
-        by channel, over what the clip shows.
+        Exposure and light differ from clip to clip, so the clip is brought towards the model's own colour by gains, one
+        a channel. What may be the light on the side it shows is evened out by half only, as a picture of that side
+        should keep some of it; what goes beyond is exposure, and taken off.
         """
-        expected = (self._field * self._clip_weight[:, None]).sum(axis=0, dtype=np.float64)
-        gain = np.clip(expected / (self._clip_total.sum(axis=0, dtype=np.float64) + 1e-6), 0.5, 2.0)
+        weight = self._clip_weight[:, None]
+        colour = self._clip_total / np.maximum(weight, 1e-9)
+        wanted = (weight * colour * self._field).sum(axis=0, dtype=np.float64)
+        gain = np.clip(wanted / ((weight * colour * colour).sum(axis=0, dtype=np.float64) + 1e-6), 0.5, 2.0)
+        gain /= np.sqrt(np.clip(gain, 1 / _LIGHT, _LIGHT))
         self._total += np.minimum(self._clip_total * gain.astype(np.float32), self._clip_weight[:, None])
         self._weight += self._clip_weight
         self._clip_total[:], self._clip_weight[:] = 0, 0

@@ -92,6 +92,12 @@ class ClipQuality:
     source_frames: int
     skinning_error_8: float
     skinning_error_4: float
+    mask_area_px: np.ndarray
+
+    @property
+    def unexplained(self) -> float:
+        """Share of the object's area, over all compared frames together, that the model does not cover."""
+        return unexplained_share([self])
 
     def as_json(self) -> dict[str, object]:
         """For ``quality.json``."""
@@ -111,6 +117,7 @@ class ClipQuality:
             "iou_worst": number(np.nanmin(self.iou)) if np.isfinite(self.iou).any() else None,
             "missing_mean": mean_number(self.missing),
             "extra_mean": mean_number(self.extra),
+            "unexplained_mask_area": number(self.unexplained),
             "root_confidence_mean": mean_number(self.root_confidence),
             "mask_confidence_mean": mean_number(self.mask_confidence),
             "kept_frames": len(self.source_idx),
@@ -118,6 +125,16 @@ class ClipQuality:
             "skinning_error": {"8": number(self.skinning_error_8, 6), "4": number(self.skinning_error_4, 6)},
             "frames": rows,
         }
+
+
+def unexplained_share(clips: Sequence[ClipQuality]) -> float:
+    """Area of the masks that the model does not cover, over the area of the masks; NaN where nothing was compared."""
+    uncovered = total = 0.0
+    for clip in clips:
+        there = np.isfinite(clip.missing)
+        uncovered += float((clip.missing[there] * clip.mask_area_px[there]).sum())
+        total += float(clip.mask_area_px[there].sum())
+    return uncovered / total if total else float("nan")
 
 
 def number(value: float, digits: int = 4) -> float | None:
@@ -243,9 +260,11 @@ def report(
         "advice": verdict.advice,
         "iou_mean": mean_number(np.concatenate([c.iou for c in clips])),
         "unseen_area": round(unseen, 4),
+        "unexplained_mask_area": number(unexplained_share(clips)),
         "skinning_error": number(max(c.skinning_error_8 for c in clips), 6),
         "skinning_error_4": number(max(c.skinning_error_4 for c in clips), 6),
         "length": mesh.length,
         **asdict(facts),
         "videos": {c.name: c.as_json() for c in clips},
+        "views_per_vertex": views.astype(int).tolist(),
     }

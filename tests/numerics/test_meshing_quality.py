@@ -35,6 +35,7 @@ def clip(
         4,
         skinning,
         skinning,
+        100 * ones,
     )
 
 
