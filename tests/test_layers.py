@@ -77,7 +77,7 @@ def test_package_inits_hold_no_code() -> None:
         nodes = ast.parse(path.read_text(encoding="utf-8")).body
         if path.parent.name == "pipeline":  # its public names
             assert all(isinstance(n, ast.ImportFrom | ast.Expr | ast.Assign) for n in nodes), path
-        elif path.parent == ROOT / "stages":  # the pipeline as data
+        elif path.parent in (ROOT / "stages", ROOT / "stages" / "retargeting"):  # pipelines as data
             assert not any(isinstance(n, ast.Import | ast.ImportFrom) for n in nodes), path
         else:
             assert not nodes, f"{path} is not empty"
