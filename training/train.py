@@ -125,8 +125,8 @@ def train(
     draw = Random(seed)
     network = Network()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    places = [make_surface(name, seed + k) for k, name in enumerate(CATEGORIES)]
-    surfaces = nn.ModuleList(places)
+    each = [make_surface(name, seed + k) for k, name in enumerate(CATEGORIES)]
+    surfaces = nn.ModuleList(each)
     if start is not None:
         state = torch.load(start, weights_only=True)
         network.load_state_dict(state["network"])
@@ -147,7 +147,7 @@ def train(
                 group["lr"] = rate * min(1.0, (step + 1) / 200) * _fall(share)
             network.train()
             loss, figures = step_losses(
-                network, places, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
+                network, each, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
             )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
