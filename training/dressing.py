@@ -59,6 +59,10 @@ class Batch:
     present: Tensor  # (B,) bool: the object is in the picture
     shown: Tensor  # (B, 1, S, S) what a mask given as a prompt would cover: the object, or a thing in its place
 
+    def to(self, device: torch.device) -> Batch:
+        """The same on another device."""
+        return Batch(*(value.to(device) for value in vars(self).values()))
+
 
 class Random:
     """Draws from one generator."""

@@ -183,7 +183,7 @@ def posenet_model(network: Network, category: int, provenance: dict[str, str]) -
 
 def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]:
     """Write all files; returns their sha256 by name."""
-    saved = torch.load(state, weights_only=True)
+    saved = torch.load(state, weights_only=True, map_location="cpu")
     network = Network().eval()
     network.load_state_dict(saved["network"])
     surfaces = nn.ModuleList(make_surface(name, 0) for name in CATEGORIES)

@@ -52,7 +52,7 @@ class Surface(nn.Module):
         at = (label >= 0).flatten().nonzero()[:, 0]
         if len(at) == 0:
             return embedded.sum() * 0
-        at = at[draw.below(len(at), min(pixels, len(at)))]
+        at = at[draw.below(len(at), min(pixels, len(at))).to(at.device)]
         chosen = embedded.permute(0, 2, 3, 1).reshape(-1, EMBEDDING)[at]
         logits = self.sharpness.exp() * (chosen @ self.embedding().T)
         return functional.cross_entropy(logits, self.target[label.flatten()[at]])
@@ -61,10 +61,10 @@ class Surface(nn.Module):
 def view_targets(view: Tensor) -> Tensor:
     """(B, 36 + 12 + 12) soft bins of azimuth, elevation and roll (B, 3) in radians; each block sums to 1."""
     degrees = torch.rad2deg(view)
-    around = (degrees[:, :1] - torch.tensor(AZIMUTH_DEG) + 180) % 360 - 180
+    around = (degrees[:, :1] - degrees.new_tensor(AZIMUTH_DEG) + 180) % 360 - 180
     blocks = [functional.softmax(-(around**2) / (2 * AZIMUTH_SPREAD_DEG**2), dim=1)]
     for k, centres in ((1, ELEVATION_DEG), (2, ROLL_DEG)):
-        off = degrees[:, k : k + 1].clamp(centres[0], centres[-1]) - torch.tensor(centres)
+        off = degrees[:, k : k + 1].clamp(centres[0], centres[-1]) - degrees.new_tensor(centres)
         blocks.append(functional.softmax(-(off**2) / (2 * ANGLE_SPREAD_DEG**2), dim=1))
     return torch.cat(blocks, 1)
 

@@ -24,7 +24,7 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import Shard
 from synthetic.canonical import canonical_body, laplacian_basis, mirror_vertices
 from synthetic.things import PLACES, places
-from training.dressing import Bank, Random, dress
+from training.dressing import Bank, Batch, Random, dress
 from training.losses import Surface, mask_loss, network_input, view_blocks, view_loss
 from training.network import AZIMUTH_DEG, CATEGORIES, Network
 
@@ -66,11 +66,13 @@ def step_losses(
     batches = dress(banks, things, photos, count, draw, hard)
     prompted = [draw.chance(count, 0.55) for _ in banks]
     inputs = torch.cat([network_input(b, draw, p) for b, p in zip(batches, prompted, strict=True)])
+    device = next(network.parameters()).device  # pictures are dressed on the CPU wherever the network is
+    inputs, batches = inputs.to(device), [b.to(device) for b in batches]
     with torch.autocast(inputs.device.type, torch.bfloat16):
         out = network(inputs.contiguous(memory_format=torch.channels_last))
         views = [network.look(out["coarse"][k * count : (k + 1) * count], k) for k in range(len(banks))]
         embedded = [network.embed(out["fine"][k * count : (k + 1) * count], k) for k in range(len(banks))]
-    total = torch.zeros(())
+    total = torch.zeros((), device=device)
     figures: dict[str, float] = {}
     kinds = torch.cat([torch.where(b.present, k, len(banks)) for k, b in enumerate(batches)])
     category = nn.functional.cross_entropy(out["category"].float(), kinds)
@@ -91,15 +93,15 @@ def step_losses(
     return total, figures
 
 
-def _progress(logits: Tensor, mask: Tensor, batch: object) -> dict[str, float]:
+def _progress(logits: Tensor, mask: Tensor, batch: Batch) -> dict[str, float]:
     """Median azimuth error, share over 90 degrees, mean mask IoU of one batch."""
     with torch.no_grad():
-        guess = torch.tensor(AZIMUTH_DEG)[view_blocks(logits)[0].argmax(1)]
-        error = ((guess - torch.rad2deg(batch.view[:, 0]) + 180) % 360 - 180).abs()[batch.present]  # type: ignore[attr-defined]
+        guess = logits.new_tensor(AZIMUTH_DEG, dtype=torch.float32)[view_blocks(logits)[0].argmax(1)]
+        error = ((guess - torch.rad2deg(batch.view[:, 0]) + 180) % 360 - 180).abs()[batch.present]
         found = mask > 0
-        truth = nn.functional.interpolate(batch.mask, mask.shape[1:], mode="area")[:, 0] > 0.5  # type: ignore[attr-defined]
+        truth = nn.functional.interpolate(batch.mask, mask.shape[1:], mode="area")[:, 0] > 0.5
         union = (found | truth).sum((1, 2)).clamp_min(1)
-        overlap = ((found & truth).sum((1, 2)) / union)[batch.present]  # type: ignore[attr-defined]
+        overlap = ((found & truth).sum((1, 2)) / union)[batch.present]
         return {
             "azimuth_median_deg": float(error.median()),
             "reversed": float((error > 90).float().mean()),
@@ -118,6 +120,7 @@ def train(
     rate: float = 1.2e-3,
     steps: int | None = None,
     start: Path | None = None,
+    device: str = "cpu",
 ) -> tuple[Network, nn.ModuleList]:
     """Train until the clock (or `steps`) says stop; returns the averaged network and the surfaces."""
     torch.manual_seed(seed)
@@ -128,9 +131,11 @@ def train(
     each = [make_surface(name, seed + k) for k, name in enumerate(CATEGORIES)]
     surfaces = nn.ModuleList(each)
     if start is not None:
-        state = torch.load(start, weights_only=True)
+        state = torch.load(start, weights_only=True, map_location="cpu")
         network.load_state_dict(state["network"])
         surfaces.load_state_dict(state["surfaces"])
+    network.to(device)
+    surfaces.to(device)
     averaged = copy.deepcopy(network).eval()
     weights = [*network.parameters(), *surfaces.parameters()]
     optimiser = torch.optim.AdamW(weights, rate, weight_decay=0.02, betas=(0.9, 0.98))
@@ -146,9 +151,7 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (step + 1) / 200) * _fall(share)
             network.train()
-            loss, figures = step_losses(
-                network, each, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15)
-            )
+            loss, figures = step_losses(network, each, banks, things, photos, batch, draw, min(1.0, 0.2 + share / 0.15))
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             nn.utils.clip_grad_norm_(weights, 1.0)
@@ -203,6 +206,7 @@ def main(
     threads: int = 1,
     photos: int = 3000,
     start: Path | None = None,
+    device: str = "cpu",
 ) -> None:
     """Train the networks.
 
@@ -215,6 +219,7 @@ def main(
         threads: CPU threads.
         photos: How many backgrounds to make.
         start: A `state.pt` to go on from.
+        device: Where the network is trained: cpu or cuda. Pictures are dressed on the CPU.
     """
     import numpy as np
 
@@ -231,6 +236,7 @@ def main(
         seed,
         batch,
         start=start,
+        device=device,
     )
 
 
