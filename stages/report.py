@@ -34,6 +34,7 @@ _CURVES = {
     "eikonal": "Smooth distances",
     "motion": "Jerk of the bones",
 }
+_ORDER = ("frames", "masks", "flow", "features", "poses", "fit", "correct", "refine", "export", "report")
 _VERDICTS = {"good": "good", "usable with care": "care"}
 
 
@@ -105,6 +106,7 @@ def report(
         "clips": clips,
         **_curves([("fit", fit), ("correct", correct), ("refine", refine)]),
         "root_poses": _root_poses(poses),
+        "stages": list(_ORDER),
         "three": "r187",
     }
     text = page.render(data, pictures.uri("model/gltf-binary", model))

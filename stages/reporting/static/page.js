@@ -46,7 +46,7 @@
   /* ---------------------------------------------------------------- views */
   $("compass").append(BanmoCharts.compass(data.clips));
   for (const [name, share] of data.sides) {
-    const row = make("div", "side"), meter = make("div", "meter"), fill = make("i"); fill.style.width = percent(share); meter.append(fill);
+    const row = make("div", "side"), meter = make("div", "meter"), fill = make("i"); fill.style.width = `${100 * share}%`; meter.append(fill);
     row.append(make("span", "", name), meter, make("span", "n", percent(share))); $("sides").append(row);
   }
 
@@ -92,10 +92,12 @@
   if (ran.length) {
     const stages = new Map();
     for (const r of ran) { const s = stages.get(r.stage) || { seconds: 0, count: 0, reasons: new Set(), when: "" }; s.seconds += r.seconds; s.count++; if (r.reason) s.reasons.add(r.reason); if (r.when > s.when) s.when = r.when; stages.set(r.stage, s); }
+    const order = (n) => { const i = data.stages.indexOf(n); return i < 0 ? 99 : i; };
+    const sorted = [...stages].sort((a, b) => order(a[0]) - order(b[0]));
     const most = Math.max(...[...stages.values()].map((s) => s.seconds), 1e-9), total = [...stages.values()].reduce((a, s) => a + s.seconds, 0);
-    const table = make("table"), head = make("tr"), body = make("tbody");
+    const table = make("table", "plan"), head = make("tr"), body = make("tbody");
     for (const [t, n] of [["Stage", 0], ["Time", 1], ["", 0], ["Results", 1], ["Why it ran", 0], ["When (UTC)", 0]]) head.append(make("th", n ? "n" : "", t));
-    for (const [name, s] of stages) {
+    for (const [name, s] of sorted) {
       const row = make("tr"), meter = make("div", "meter"), fill = make("i"), cell = make("td"); fill.style.width = `${100 * s.seconds / most}%`; meter.append(fill); cell.append(meter);
       const reasons = [...s.reasons]; const why = reasons.slice(0, 3).join("; ") + (reasons.length > 3 ? ` and ${reasons.length - 3} more` : "");
       row.append(make("td", "", name), make("td", "n", seconds(s.seconds)), cell, make("td", "n", String(s.count)), make("td", "", why), make("td", "", s.when.replace("T", " ").slice(0, 16))); body.append(row);
