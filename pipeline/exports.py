@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -132,4 +133,37 @@ def _provenance(project: Project, wanted: dict[str, str], results: dict[str, Rec
         "preset": project.settings.preset,
         "actions": {label: record.key for label, record in results.items()},
         "settings": {s: v for s, v in project.settings.values.items() if s in project.definition.stages},
+        "files_of_settings": _files_of_settings(project),
+        "said": {label: said for label, record in results.items() if (said := _texts(record.metrics))},
+        "software": {name: version for record in results.values() for name, version in record.versions.items()},
     }
+
+
+def _texts(metrics: dict[str, Any]) -> dict[str, str]:
+    """What a stage recorded in words: which method or network it took, for one."""
+    return {name: value for name, value in metrics.items() if isinstance(value, str)}
+
+
+def _files_of_settings(project: Project) -> dict[str, dict[str, Any]]:
+    """Of each setting that names a file or a folder: where it is, and the table ``[about]`` of a TOML file in it.
+
+    Such a table says where a file comes from and under what licence.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for stage, values in project.settings.values.items():
+        for name, value in values.items() if stage in project.definition.stages else ():
+            path = Path(str(value)) if isinstance(value, str | Path) and str(value) else None
+            if path is None or not path.is_absolute() or not path.exists():
+                continue
+            beside = sorted(path.glob("*.toml")) if path.is_dir() else [path.with_suffix(".toml")]
+            about = next((t for t in map(_about, beside) if t), {})
+            found[f"{stage}.{name}"] = {"path": str(path), "about": about}
+    return found
+
+
+def _about(path: Path) -> dict[str, Any]:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8")).get("about", {})
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return {k: v for k, v in table.items() if isinstance(v, str | int | float)} if isinstance(table, dict) else {}

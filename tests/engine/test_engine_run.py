@@ -30,6 +30,18 @@ def test_first_run_makes_everything_and_says_so(lab: Lab) -> None:
     assert (lab.workspace / "tmp").exists() is False or not list((lab.workspace / "tmp").iterdir())
 
 
+def test_provenance_tells_software_and_where_files_come_from(lab: Lab) -> None:
+    table = lab.root / "table.txt"
+    table.write_text("walks runs\n")
+    table.with_suffix(".toml").write_text('[about]\nlicence = "MIT"\nsource = "somewhere"\n')
+    lab.run(f"--words.table={table}")
+    provenance = json.loads((lab.workspace / "exports" / "provenance.json").read_text())
+    assert provenance["software"]["python"].count(".") == 2
+    named = provenance["files_of_settings"]["words.table"]
+    assert named == {"path": str(table), "about": {"licence": "MIT", "source": "somewhere"}}
+    assert provenance["settings"]["words"]["table"] == str(table)
+
+
 def test_second_run_does_nothing_and_imports_nothing_heavy(lab: Lab) -> None:
     lab.run()
     runs = list((lab.workspace / "runs").iterdir())
