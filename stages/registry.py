@@ -21,7 +21,7 @@ from typing import Any
 from pipeline import BadInput
 
 REGISTRY = Path(__file__).with_name("weights.toml")
-SLOTS = ("masks", "flow", "features", "tokens")
+SLOTS = ("masks", "flow", "features")
 NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 MODEL, FACTS = "network.onnx", "network.toml"
 _TEXTS = ("slot", "summary", "url", "licence", "source")
@@ -111,11 +111,20 @@ def find(name: str) -> str | None:
 
 def about(folder: Path) -> dict[str, Any]:
     """The table ``[about]`` of a network that is here; empty when it cannot be read."""
+    found = _facts(folder).get("about", {})
+    return found if isinstance(found, dict) else {}
+
+
+def contract_table(folder: Path) -> dict[str, Any]:
+    """The contract of a network that is here, as it is written."""
+    return {key: value for key, value in _facts(folder).items() if key != "about"}
+
+
+def _facts(folder: Path) -> dict[str, Any]:
     try:
-        found = tomllib.loads((folder / FACTS).read_text(encoding="utf-8")).get("about", {})
+        return tomllib.loads((folder / FACTS).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def keep(

@@ -1,59 +1,53 @@
-"""Which network class a slot wants, and a trial of a file: opened, shown a picture, its answer looked at."""
+"""A trial of a network for a slot: opened as its stage would, shown a picture, its answer looked at."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from stages.contracts import PICTURE, locate, read_contract
-from stages.networks import FeatureNetwork, FlowNetwork, MaskNetwork, PromptedMaskNetwork, TokenNetwork
+from stages.networks import FeatureNetwork, FlowNetwork, PromptedMaskNetwork, TokenNetwork, mask_network
+from stages.onnx_session import Network
 
 _SIDE_PX = 192
-
-
-def mask_network(
-    network: str | Path, contract: str | Path = "", *, device: str = "cpu", threads: int = 1
-) -> MaskNetwork | PromptedMaskNetwork:
-    """The mask network of a setting, by the kind that its contract names."""
-    beside = locate(network, contract)[1]
-    kind = PromptedMaskNetwork if read_contract(beside, PICTURE).kind == "prompted" else MaskNetwork
-    return kind(network, contract, device=device, threads=threads)
+_BOX = (50, 60, 140, 130)
 
 
 def trial(network: Path, slot: str, contract: str | Path = "", device: str = "cpu") -> str:
-    """Open a network as a stage would and show it one picture; a line on what it is and how long it took.
+    """Open a network as the stage `slot` would and show it one picture; a line on what it is and how long it took.
 
     Raises BadInput when the file cannot be trusted or does not do what the slot wants.
     """
-    rows, columns = np.mgrid[0:_SIDE_PX, 0:_SIDE_PX]
-    picture = np.stack([rows, columns, (rows + columns) // 2], axis=-1).astype(np.uint8)
-    picture[60:130, 50:140] = (210, 120, 40)
     started = time.monotonic()
-    if slot == "masks":
-        opened = mask_network(network, contract, device=device)
-        opened_s = time.monotonic()
-        found = (
-            opened(picture, np.array([50, 60, 140, 130]))
-            if isinstance(opened, PromptedMaskNetwork)
-            else opened(picture)
-        )
-    elif slot == "flow":
-        opened = FlowNetwork(network, contract, device=device)
-        opened_s = time.monotonic()
-        found = opened(picture, picture)
-    elif slot == "tokens":
-        opened = TokenNetwork(network, contract, device=device)
-        opened_s = time.monotonic()
-        found = opened(picture)
-    else:
-        opened = FeatureNetwork(network, contract, device=device)
-        opened_s = time.monotonic()
-        found = opened(picture, 112)
+    opened, show = _open(network, slot, contract, device)
+    opened_s = time.monotonic()
+    found = show()
     ended = time.monotonic()
     size = "any size" if opened.size is None else f"{opened.size[1]}x{opened.size[0]}"
     return (
         f"{opened.path.stat().st_size / 1e6:.1f} MB, {slot}, takes {size}, gives {'x'.join(map(str, found.shape))}, "
         f"on {opened.on}; opened in {opened_s - started:.1f} s, a picture in {ended - opened_s:.2f} s"
     )
+
+
+def _open(network: Path, slot: str, contract: str | Path, device: str) -> tuple[Network, Callable[[], np.ndarray]]:
+    """The network of a slot, and how to show it the test picture."""
+    rows, columns = np.mgrid[0:_SIDE_PX, 0:_SIDE_PX]
+    picture = np.stack([rows, columns, (rows + columns) // 2], axis=-1).astype(np.uint8)
+    picture[_BOX[1] : _BOX[3], _BOX[0] : _BOX[2]] = (210, 120, 40)
+    if slot == "masks":
+        mask = mask_network(network, contract, device=device)
+        if isinstance(mask, PromptedMaskNetwork):
+            return mask, lambda: mask(picture, np.array(_BOX, float))
+        return mask, lambda: mask(picture)
+    if slot == "flow":
+        flow = FlowNetwork(network, contract, device=device)
+        return flow, lambda: flow(picture, picture)
+    if read_contract(locate(network, contract)[1], PICTURE).kind == "tokens":
+        tokens = TokenNetwork(network, contract, device=device)
+        return tokens, lambda: tokens(picture)
+    features = FeatureNetwork(network, contract, device=device)
+    return features, lambda: features(picture, 112)

@@ -16,6 +16,7 @@ EXAMPLES = (
     "banmo weights list",
     'banmo weights get isnet                        then in pipeline.toml: [masks] network = "isnet"',
     "banmo weights add my.onnx --name mine --slot masks --contract my.toml",
+    "banmo weights fit dinov2-small --as dinov2-cats    reduce its tokens to 16 channels over the clips of a workspace",
     "banmo weights check                            every network that is here",
     "banmo weights check my.onnx --slot features",
 )
@@ -25,11 +26,12 @@ NEEDS_WORKSPACE = False
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Flags."""
     add = parser.add_argument
-    add("action", choices=("list", "get", "add", "check"), help="what to do")
-    add("what", nargs="*", metavar="NAME", help="names (get, check), or an ONNX file (add, check)")
+    add("action", choices=("list", "get", "add", "fit", "check"), help="what to do")
+    add("what", nargs="*", metavar="NAME", help="names (get, fit, check), or an ONNX file (add, check)")
     add("--name", metavar="NAME", help="add: what to call it; default: the name of the file")
-    add("--slot", choices=("masks", "flow", "features", "tokens"), help="add, check: the stage that takes it")
+    add("--slot", choices=("masks", "flow", "features"), help="add, check: the stage that takes it")
     add("--contract", type=Path, metavar="TOML", help="add, check: what the network expects; see docs/slots.md")
+    add("--as", dest="other", metavar="NAME", help="fit: what to call the result; default: the name with -fitted")
     add("--licence", default="", metavar="TEXT", help="add: a note of its licence, shown by list")
     add(
         "--from",
@@ -47,6 +49,8 @@ def run(args: argparse.Namespace, results: Results | None) -> int:
         return _get(args)
     if args.action == "add":
         return _add(args)
+    if args.action == "fit":
+        return _fit(args)
     return _check(args)
 
 
@@ -125,16 +129,14 @@ def _add(args: argparse.Namespace) -> int:
     from stages.download import digest_of
 
     if len(args.what) != 1 or not args.slot:
-        raise BadInput(
-            "banmo weights add wants one ONNX file and --slot", hint="--slot masks, flow, features or tokens"
-        )
+        raise BadInput("banmo weights add wants one ONNX file and --slot", hint="--slot masks, flow or features")
     path = Path(args.what[0]).expanduser()
     if not path.is_file():
         raise BadInput("there is no such file", where=path)
     name = args.name or path.stem.lower()
     if name in registry.read_registry():
         raise BadInput(f"{name!r} is the name of a known network", hint="choose another with --name")
-    contract: dict[str, Any] = {"kind": "tokens"} if args.slot == "tokens" else {}
+    contract: dict[str, Any] = {}
     if args.contract is not None:
         _judge(path, args.slot, args.contract)  # says what is wrong with the file as the user named it
         if args.contract.stat().st_size <= MAX_CONTRACT_BYTES:
@@ -155,6 +157,25 @@ def _add(args: argparse.Namespace) -> int:
     return 0
 
 
+def _fit(args: argparse.Namespace) -> int:
+    from stages import registry
+    from stages.tokens import fit_axes
+
+    if len(args.what) != 1:
+        raise BadInput("banmo weights fit wants the name of one network of tokens", hint="such as dinov2-small")
+    name = args.what[0]
+    folder = registry.find(name)
+    if folder is None:
+        raise BadInput(f"there is no network {name!r} here", hint="banmo weights list")
+    target = args.other or f"{name}-fitted"
+    if target in registry.read_registry():
+        raise BadInput(f"{target!r} is the name of a known network", hint="choose another with --as")
+    with registry.locked(target):
+        made, told = fit_axes(Path(folder), target, Results(args.workspace))
+    _say(f'{told}\nhere: {made}\nuse it: [features] network = "{target}"')
+    return 0
+
+
 def _check(args: argparse.Namespace) -> int:
     from stages import registry
     from stages.download import digest_of
@@ -171,7 +192,7 @@ def _check(args: argparse.Namespace) -> int:
         facts = registry.about(folder) if folder is not None else {}
         slot = args.slot or facts.get("slot")
         if slot not in registry.SLOTS:
-            raise BadInput(f"for which stage is {word}?", hint="--slot masks, flow, features or tokens")
+            raise BadInput(f"for which stage is {word}?", hint="--slot masks, flow or features")
         try:
             if folder is not None:
                 kind = "sha256" if "sha256" in facts else "md5"
