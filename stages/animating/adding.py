@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.animating.glb import GlbError, split_glb
+from stages.animating.container import GlbError, split_glb
 
 
 @dataclass(frozen=True)

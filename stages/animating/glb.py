@@ -6,21 +6,15 @@ never more memory than the file itself is long, times a small factor.
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_DTYPE = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+from stages.animating.container import GlbError, index_of, read_accessor, split_glb, view_bytes
+
 _PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-
-
-class GlbError(ValueError):
-    """A GLB file that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,7 @@ class Glb:
         joints = skins[0].get("joints") if skins and isinstance(skins[0], dict) else None
         if not isinstance(joints, list) or not joints:
             raise GlbError("has no skin: nothing in it can be posed")
-        return [_index(j, len(self.names), "joint") for j in joints]
+        return [index_of(j, len(self.names), "joint") for j in joints]
 
     def inverse_bind(self) -> np.ndarray:
         """joint_from_mesh (B, 4, 4) at rest, of the first skin."""
@@ -164,7 +158,7 @@ class Glb:
         """The first embedded picture (PNG or JPEG bytes), None where there is none."""
         images = self.document.get("images") or []
         view = images[0].get("bufferView") if images and isinstance(images[0], dict) else None
-        return None if view is None else _view_bytes(self.document, self.blob, view)
+        return None if view is None else view_bytes(self.document, self.blob, view)
 
     def _primitive(self) -> dict[str, Any]:
         try:
@@ -197,48 +191,19 @@ def read_glb(data: bytes) -> Glb:
         raise GlbError(f"is not a well-formed glTF 2.0 file ({type(error).__name__}: {error})") from error
 
 
-def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON document and the binary chunk of a GLB. Raises GlbError."""
-    if len(data) < 20 or data[:4] != b"glTF":
-        raise GlbError("is not a GLB file")
-    version, total = struct.unpack("<II", data[4:12])
-    length, kind = struct.unpack("<I4s", data[12:20])
-    if version != 2:
-        raise GlbError(f"is glTF version {version}, not 2")
-    if total > len(data) or 20 + length > total:
-        raise GlbError("is cut off")
-    if kind != b"JSON":
-        raise GlbError("does not begin with its JSON chunk")
-    try:
-        document = json.loads(data[20 : 20 + length].decode("utf-8"))
-    except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise GlbError(f"has a damaged JSON chunk ({type(error).__name__})") from error
-    if not isinstance(document, dict):
-        raise GlbError("has no JSON object")
-    start = 20 + length
-    blob = b""
-    if start + 8 <= total:
-        size, kind = struct.unpack("<I4s", data[start : start + 8])
-        if kind == b"BIN\0":
-            if start + 8 + size > total:
-                raise GlbError("is cut off")
-            blob = data[start + 8 : start + 8 + size]
-    return document, blob
-
-
 def _build(document: dict[str, Any], blob: bytes) -> Glb:
     nodes = document.get("nodes") or []
     count = len(nodes)
     parent = np.full(count, -1)
     for i, node in enumerate(nodes):
         for child in node.get("children", ()):
-            at = _index(child, count, "child")
+            at = index_of(child, count, "child")
             if parent[at] >= 0 or at == i:
                 raise GlbError("its nodes are no tree")
             parent[at] = i
     order = [i for i in range(count) if parent[i] < 0]
     for node_idx in order:  # grows while it is read: breadth first
-        order.extend(_index(c, count, "child") for c in nodes[node_idx].get("children", ()))
+        order.extend(index_of(c, count, "child") for c in nodes[node_idx].get("children", ()))
     if len(order) != count:
         raise GlbError("its nodes go round in a circle")
     translation, rotation, scale = np.zeros((count, 3)), np.zeros((count, 4)), np.ones((count, 3))
@@ -269,8 +234,8 @@ def _animation(document: dict[str, Any], blob: bytes, record: dict[str, Any], nu
         path = target.get("path")
         if path not in _PATHS or "node" not in target:
             continue  # weights of morph targets and extensions move no joint
-        node = _index(target["node"], count, "node")
-        sampler = record["samplers"][_index(channel["sampler"], len(record["samplers"]), "sampler")]
+        node = index_of(target["node"], count, "node")
+        sampler = record["samplers"][index_of(channel["sampler"], len(record["samplers"]), "sampler")]
         kind = sampler.get("interpolation", "LINEAR")
         times = read_accessor(document, blob, sampler["input"]).reshape(-1).astype(np.float64)
         values = read_accessor(document, blob, sampler["output"]).astype(np.float64)
@@ -283,50 +248,6 @@ def _animation(document: dict[str, Any], blob: bytes, record: dict[str, Any], nu
         tracks.append(Track(node, path, times, _unit(values) if path == "rotation" else values, kind))
     extras = record.get("extras")
     return Animation(str(record.get("name", f"animation_{number}")), tracks, extras if isinstance(extras, dict) else {})
-
-
-def read_accessor(document: dict[str, Any], blob: bytes, index: Any) -> np.ndarray:
-    """Elements (N, C) of an accessor, checked against the buffer."""
-    accessors = document.get("accessors") or []
-    accessor = accessors[_index(index, len(accessors), "accessor")]
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise GlbError("uses sparse accessors, which are not read here")
-    if accessor.get("componentType") not in _DTYPE or accessor.get("type") not in _WIDTH:
-        raise GlbError("has an accessor of an unknown type")
-    dtype, width = np.dtype(_DTYPE[accessor["componentType"]]), _WIDTH[accessor["type"]]
-    count, offset = accessor.get("count"), accessor.get("byteOffset", 0)
-    if not isinstance(count, int) or not isinstance(offset, int) or count < 0 or offset < 0:
-        raise GlbError("has an accessor without a count")
-    raw = _view_bytes(document, blob, accessor["bufferView"])
-    view = document["bufferViews"][accessor["bufferView"]]
-    item = dtype.itemsize * width
-    stride = view.get("byteStride", item)
-    if not isinstance(stride, int) or stride < item or (count and offset + stride * (count - 1) + item > len(raw)):
-        raise GlbError("has an accessor that leaves its buffer")
-    data = np.ndarray((count, width), dtype, raw, offset, (stride, dtype.itemsize)) if count else np.zeros((0, width))
-    if accessor.get("normalized") and dtype.kind in "iu":
-        return np.maximum(data / np.iinfo(dtype).max, -1.0)
-    return np.array(data)
-
-
-def _view_bytes(document: dict[str, Any], blob: bytes, index: Any) -> bytes:
-    views = document.get("bufferViews") or []
-    view = views[_index(index, len(views), "buffer view")]
-    buffers = document.get("buffers") or []
-    if view.get("buffer", 0) != 0 or not buffers or "uri" in buffers[0]:
-        raise GlbError("keeps its data outside the file")
-    start, length = view.get("byteOffset", 0), view.get("byteLength")
-    if not isinstance(start, int) or not isinstance(length, int) or start < 0 or length < 0:
-        raise GlbError("has a malformed buffer view")
-    if start + length > len(blob):
-        raise GlbError("has a buffer view that leaves its buffer")
-    return blob[start : start + length]
-
-
-def _index(value: Any, count: int, what: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < count:
-        raise GlbError(f"names a {what} that is not there")
-    return value
 
 
 def _numbers(value: Any, count: int) -> np.ndarray:
