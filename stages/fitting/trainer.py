@@ -14,6 +14,7 @@ from torch import Tensor
 
 from stages.fitting.active import Uncertainty, most_uncertain
 from stages.fitting.batches import Batch, draw, step_generator
+from stages.fitting.connect import mend
 from stages.fitting.diagnose import FrameFigures, frame_figures, misfits, replace_from_neighbours
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
@@ -100,6 +101,8 @@ class Trainer:
 
     def refresh(self) -> None:
         """Extract the surface anew and each frame's box around it: near and far planes, matching bounds."""
+        if self.settings.mend and self.settings.lr_sdf > 0 and self.progress >= self.settings.mend_from:
+            mend(self.model)
         points = self.team.agree(surface_points(self.model).to(self.device))
         if len(points) >= 100:
             self.model.surface = points
