@@ -1,6 +1,6 @@
 """How well a model follows another animal: ``banmo retarget`` by a generated clip whose motion is known.
 
-``python -m benchmarks.retarget --workspace W --out DIR [--kind dog --seed 21 --frames 60 --given]``
+``python -m benchmarks.retarget --workspace W --out DIR [--kind dog|person --seed 21 --frames 60 --given]``
 
 A clip of a generated quadruped is filmed and given to ``banmo retarget`` raw (with ``--given``: with true masks and
 root poses beside it). Scored are directions of limbs before the camera, in degrees against the truth: from shoulder or
@@ -38,13 +38,22 @@ TRUE_LIMBS = {
     "tail": ("pelvis", "tail4"),
     "trunk": ("pelvis", "chest"),
 }
+TRUE_LIMBS_OF_PEOPLE = {
+    "leg_left": ("thigh_left", "foot_left"),
+    "leg_right": ("thigh_right", "foot_right"),
+    "arm_left": ("arm_left", "hand_left"),
+    "arm_right": ("arm_right", "hand_right"),
+    "head": ("chest", "head"),
+    "trunk": ("pelvis", "chest"),
+}
 
 
 def true_directions(truth: Any, camera_from_object: np.ndarray) -> dict[str, np.ndarray]:
     """Unit directions (T, 3) of every limb before the camera."""
     names = [str(n) for n in truth["bone_names"]]
     joints = np.einsum("tij,tbj->tbi", camera_from_object[:, :3, :3], truth["joints"].astype(np.float64))
-    return {k: unit(joints[:, names.index(b)] - joints[:, names.index(a)]) for k, (a, b) in TRUE_LIMBS.items()}
+    limbs = TRUE_LIMBS_OF_PEOPLE if "clavicle_left" in names else TRUE_LIMBS
+    return {k: unit(joints[:, names.index(b)] - joints[:, names.index(a)]) for k, (a, b) in limbs.items()}
 
 
 def regions(vertices: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -70,7 +79,25 @@ def regions(vertices: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {k: v for k, v in found.items() if len(v[0]) and len(v[1])}
 
 
-def found_directions(data: bytes, name: str, articulated: bool) -> dict[str, np.ndarray]:
+def regions_of_people(vertices: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """The same of a standing person whose arms are away from the trunk."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    y = (vertices[:, 1] - low[1]) / (high[1] - low[1])
+    x = vertices[:, 0] - np.median(vertices[y < 0.5, 0])
+    found = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        own = sign * x > 0
+        found[f"leg_{side}"] = (np.flatnonzero(own & (y > 0.42) & (y < 0.52)), np.flatnonzero(own & (y < 0.08)))
+        reach = np.quantile((sign * x)[own], 0.96)
+        shoulder = own & (y > 0.74) & (y < 0.84) & (sign * x < 0.45 * reach)
+        found[f"arm_{side}"] = (np.flatnonzero(shoulder), np.flatnonzero(sign * x > reach))
+    chest = np.flatnonzero((y > 0.68) & (y < 0.78) & (np.abs(x) < 0.25 * np.abs(x).max()))
+    found["head"] = (chest, np.flatnonzero(y > 0.92))
+    found["trunk"] = (np.flatnonzero((y > 0.5) & (y < 0.58)), chest)
+    return {k: v for k, v in found.items() if len(v[0]) and len(v[1])}
+
+
+def found_directions(data: bytes, name: str, articulated: bool, person: bool = False) -> dict[str, np.ndarray]:
     """Unit directions (T, 3) of the model's limbs before the clip's camera; at rest if not articulated."""
     player = Player.of(read_glb(data))
     glb = player.glb
@@ -82,7 +109,7 @@ def found_directions(data: bytes, name: str, articulated: bool) -> dict[str, np.
         still[:, root] = local[:, root]
         local = still
     points = player.surface(glb.scene_from_node(local)) @ CV_FROM_GL[:3, :3]
-    parts = regions(player.vertices)
+    parts = regions_of_people(player.vertices) if person else regions(player.vertices)
     return {k: unit(points[:, b].mean(axis=1) - points[:, a].mean(axis=1)) for k, (a, b) in parts.items()}
 
 
@@ -109,7 +136,7 @@ def main(
     """Film, retarget, score.
 
     Args:
-        workspace: a finished reconstruction of a quadruped that stands at rest.
+        workspace: a finished reconstruction of a quadruped (or a person) that stands at rest.
         out: folder for the clip and the result; made anew.
         given: lay true masks and root poses beside the clip.
     """
@@ -127,8 +154,9 @@ def main(
     seconds = time.monotonic() - started
     data = (out / "result" / "exports" / "model.glb").read_bytes()
     truth = true_directions(np.load(out / "truth" / f"{made.name}.npz"), made.camera_from_object)
-    followed = errors_deg(found_directions(data, made.name, True), truth)
-    still = errors_deg(found_directions(data, made.name, False), truth)
+    person = kind == "person"
+    followed = errors_deg(found_directions(data, made.name, True, person), truth)
+    still = errors_deg(found_directions(data, made.name, False, person), truth)
     log.info("%-16s %10s %10s   degrees, mean over %d frames", "limb", "followed", "still", frames)
     for limb in followed:
         log.info("%-16s %10.1f %10.1f", limb, followed[limb], still[limb])
