@@ -68,9 +68,27 @@ _VERBS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("banmo pin                          the runs and the pins", "banmo pin 2026-09-28T10-15-00-k3fa paper"),
     ),
     "bless": ("keep", "accept a result although the code changed", ("banmo bless fit",)),
+    "compare": (
+        "share",
+        "what differs between two runs: settings, results, times, figures",
+        ("banmo compare 2026-09-28T10-15-00-k3fa latest", "banmo compare paper latest --json       pins have names"),
+    ),
+    "push": (
+        "share",
+        "copy the newest run's results to another store",
+        ("banmo push /mnt/lab/cats", "banmo push s3://bucket/cats --all", "banmo push ssh://host/data/cats -n"),
+    ),
+    "pull": (
+        "share",
+        "copy results from another store, verified on arrival",
+        ("banmo pull /mnt/lab/cats", "banmo pull s3://bucket/cats --workspace cats"),
+    ),
     "export": ("keep", "copy the last stage's files out", ("banmo export", "banmo export --to ~/cat-model")),
     "doctor": ("keep", "look at this machine and workspace", ("banmo doctor",)),
 }
+
+
+_SHARE = ("compare", "push", "pull")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -175,7 +193,7 @@ def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
     if name == "init":
         add("directory", nargs="?", type=Path, metavar="DIR", help="folder to make (default: --workspace)")
     add("--workspace", type=Path, default=Path("workspace"), metavar="DIR", help="default: ./workspace")
-    if name not in ("verify", "pin", "log"):
+    if name not in ("verify", "pin", "log", *_SHARE):
         add("--definition", default="", metavar="PACKAGE", help="package that defines the pipeline (default: stages)")
     if name in ("run", "status", "why", "inspect", "graph", "settings", "bless", "gc", "export"):
         add("--preset", metavar="NAME", help="settings by purpose; see `banmo settings`")
@@ -209,13 +227,20 @@ def _arguments(name: str, verb: argparse.ArgumentParser) -> None:
     if name == "gc":
         add("--apply", action="store_true", help="delete; without it only say what would go")
         add("--keep", type=int, metavar="N", help="runs to keep (default: execution.keep_runs)")
+    if name == "compare":
+        add("old", metavar="RUN", help="id of a run, a pin, or `latest`")
+        add("new", metavar="RUN", help="the run to compare it with")
+    if name in ("push", "pull"):
+        add("url", metavar="URL", help="a folder, s3://bucket/prefix, ssh://host/path, …")
+        add("--all", action="store_true", help="the results of every run, not only of the newest")
+        add("-n", "--dry-run", action="store_true", help="say what would travel, and stop")
     if name == "pin":
         add("run", nargs="?", metavar="RUN", help="id of a run, or `latest`")
         add("name", nargs="?", metavar="NAME")
         add("--remove", metavar="NAME", help="let go of a pin")
     if name == "export":
         add("--to", type=Path, metavar="DIR", help="default: exports/ in the workspace")
-    if name in ("run", "status", "why", "inspect", "verify", "gc", "pin", "doctor", "graph", "settings"):
+    if name in ("run", "status", "why", "inspect", "verify", "gc", "pin", "doctor", "graph", "settings", *_SHARE):
         add("--json", action="store_true", help="for machines")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ from pipeline.action import Action, action
 from pipeline.graph import Graph, Node
 from pipeline.ledger import Record
 from pipeline.reasons import Reason, compare, nearest
+from pipeline.remote import Remote
 from pipeline.settings import Settings, stage_values
+from pipeline.transfer import fetch
 from pipeline.videos import SourceDigests
 from pipeline.workspace import Workspace
 
@@ -62,6 +65,8 @@ class Planner:
         else:
             wanted = self.action(node)
             record = self.workspace.ledger.find(node.info.name, wanted.key)
+            if self._elsewhere is not None and node not in self.forced and not self._serves(node, record):
+                record = fetch(self.workspace, self._elsewhere, node.info.name, wanted.key) or record
             if record is None:
                 record, reasons = self._reasons(node, wanted)
                 step = Step(node, RUN, wanted, record, reasons)
@@ -74,6 +79,15 @@ class Planner:
                 self.results[node.label] = record
         self.steps[node.label] = step
         return step
+
+    def _serves(self, node: Node, record: Record | None) -> bool:
+        return record is not None and self.workspace.objects.sound(node.info.name, record.digest)
+
+    @cached_property
+    def _elsewhere(self) -> Remote | None:
+        """The shared store, if one is named."""
+        shared = self.settings.store.shared
+        return Remote(shared) if shared else None
 
     def finished(self, node: Node, record: Record) -> None:
         """Tell the planner that a node now has this result."""

@@ -66,7 +66,15 @@ class ExecutionSection:
     """Slurm: jobs of one array that run at the same time."""
 
 
-_OWN: dict[str, type] = {"pipeline": PipelineSection, "execution": ExecutionSection}
+@dataclass(frozen=True)
+class StoreSection:
+    """``[store]``: where else results may be. Never part of a key."""
+
+    shared: str = ""
+    """A store to read through to: a folder or URL that `banmo push` has filled; what is found there is copied here."""
+
+
+_OWN: dict[str, type] = {"pipeline": PipelineSection, "execution": ExecutionSection, "store": StoreSection}
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,18 @@ class Settings:
     def execution(self) -> ExecutionSection:
         """The ``[execution]`` table."""
         return ExecutionSection(**self.values["execution"])
+
+    @property
+    def store(self) -> StoreSection:
+        """The ``[store]`` table."""
+        return StoreSection(**self.values["store"])
+
+
+def check_execution(found: ExecutionSection) -> None:
+    """Raise BadInput for counts that cannot be."""
+    for name, least in (("ranks", 1), ("nodes", 1), ("slurm_time_limit_min", 1), ("slurm_parallel", 1), ("cpus", 0)):
+        if getattr(found, name) < least:
+            raise BadInput(f"[execution] {name} = {getattr(found, name)} is less than {least}")
 
 
 def sections(definition: Definition) -> dict[str, tuple[dict[str, Any], ...]]:

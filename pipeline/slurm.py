@@ -13,6 +13,7 @@ and read by the job within seconds. Nothing that came from elsewhere is unpickle
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import shlex
@@ -84,7 +85,7 @@ class SlurmExecutor:
             raise BadInput(f"{ranks} ranks cannot be spread evenly over {nodes} nodes", where="[execution]")
         requests = [RunRequest(str(x.attempt / "request.json"), str(x.log_path.absolute())) for x in launches]
         try:
-            with _own_environment():
+            with _own_environment(), contextlib.redirect_stderr(io.StringIO()):  # submitit repeats sbatch's words
                 executor = self._submitit.AutoExecutor(
                     folder=folder, cluster="slurm", slurm_max_num_timeout=_MOST_REQUEUES
                 )
@@ -166,9 +167,10 @@ class SlurmJob:
     def poll(self) -> Outcome | None:
         """The worker's own word first; then what the queue says."""
         outcome = read_outcome(self.watched.attempt)
-        if outcome is not None and outcome.status != "interrupted":
-            return self._ended(outcome)
         state = self._queue.state(self.job_id)
+        if outcome is not None and outcome.status != "interrupted":
+            others = self.watched.grant.ranks > 1 and state is not None and not state.ended
+            return None if others and self._late() else self._ended(outcome)  # the other ranks still write there
         self._tell(state)
         if state is not None and not state.ended:
             self._gone_since = None

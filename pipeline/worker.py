@@ -86,7 +86,8 @@ class Worker:
                 "record": self.record.key if self.record else None,
                 "warnings": self.context.warnings,
             }
-            write_json(self.attempt / "outcome.json", outcome)
+            if self.attempt.is_dir():  # whoever waited for rank 0 may have cleared it away
+                write_json(self.attempt / "outcome.json", outcome)
         return code
 
     def _guarded(self) -> tuple[str, str, int]:

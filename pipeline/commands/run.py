@@ -24,7 +24,7 @@ from pipeline.preflight import check_disk
 from pipeline.project import Options, Project
 from pipeline.runs import RunFolder, shows
 from pipeline.scheduler import Scheduler
-from pipeline.settings import to_toml
+from pipeline.settings import check_execution, to_toml
 from pipeline.tally import Report
 from pipeline.videos import orphans
 
@@ -129,6 +129,7 @@ def _execute(
 def _executor(project: Project, folder: RunFolder, pending: list[Step]) -> tuple[Executor, int]:
     """Where to run, and with how many cores at once."""
     execution = project.settings.execution
+    check_execution(execution)
     if execution.executor == "slurm":
         from pipeline.slurm import SlurmExecutor
 

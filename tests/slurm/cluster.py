@@ -131,6 +131,8 @@ class Cluster:
     def command(self, *words: str) -> str:
         """Standard output of a Slurm command; "" when it fails."""
         done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **self.environment})
+        with (self.root / "commands.txt").open("a") as log:
+            log.write(f"{time.strftime('%H:%M:%S')} {' '.join(words)} -> {done.returncode} {done.stderr}\n")
         return done.stdout if done.returncode == 0 else ""
 
     def stop(self) -> None:
