@@ -16,6 +16,7 @@ from stages import formats
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection
 from stages.fitting.budget import affordable_steps
+from stages.fitting.curve import loss_curve
 from stages.fitting.diagnose import misfits
 from stages.fitting.gauge import settle
 from stages.fitting.preview import preview_sheet
@@ -137,6 +138,7 @@ def _train(
             save()
             if team.leads and run.device == "cpu":
                 _write_preview(model, collection, checkpoints.root / "preview.png")
+                (checkpoints.root / "loss.svg").write_text(loss_curve(history), encoding="utf-8")
     return trainer, history
 
 
