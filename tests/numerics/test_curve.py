@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import xml.etree.ElementTree as ET
 
@@ -16,10 +17,8 @@ def points(text: str) -> list[tuple[float, float]]:
 def test_a_falling_loss_is_a_falling_curve() -> None:
     drawn = points(loss_curve([{"step": s, "total": math.exp(-s / 50)} for s in range(0, 101, 10)]))
     assert len(drawn) == 11
-    assert all(b[0] > a[0] and b[1] > a[1] for a, b in zip(drawn, drawn[1:], strict=False)), (
-        "down is larger in a picture"
-    )
-    steps = [b[1] - a[1] for a, b in zip(drawn, drawn[1:], strict=False)]
+    assert all(b[0] > a[0] and b[1] > a[1] for a, b in itertools.pairwise(drawn)), "down is larger in a picture"
+    steps = [b[1] - a[1] for a, b in itertools.pairwise(drawn)]
     assert max(steps) - min(steps) < 0.3, "an exponential is a straight line"
 
 
