@@ -11,10 +11,10 @@ import onnxruntime
 WEIGHTS = Path(__file__).parent / "weights"
 CATEGORIES = ("quadruped", "human")
 DIGESTS = {
-    "posenet-quadruped.onnx": "e31567b6d440a3604a918e3a6766ba398731433eb7b7943a383f7b79ec900119",
-    "posenet-human.onnx": "8e17b6d6024543d970eb467cd1e9ef9ed415cb2cd89631ff18c5c154d17d5f99",
-    "quadruped.npz": "08373e5a03d1254f1c6c6ebc2a0c906b477896d7a3686ba223c27289d8024793",
-    "human.npz": "9a473fd4c1fb632bef153ce3d2d1810731028a211436b49c4e7de11bcf1dbb78",
+    "posenet-quadruped.onnx": "d07aacb02603fb6e3aef885cb47ecb08912d40e5f0ec408c86842e248730baf3",
+    "posenet-human.onnx": "d2e2a25b8e9e82b84e6d616471c5d07078b2b0560cad0e0a6e87df25ce17e866",
+    "quadruped.npz": "08131d368bb1b29ac53b50747c55186bab028996b8e0a1b92598f7c03aaa02ed",
+    "human.npz": "95b6eebf697fe08a808e36dd866b8130d306c1b612b96f3e7979c2fc18e4e99e",
 }
 """sha256 of the files this code was written with; they are code as far as a result's key is concerned."""
 

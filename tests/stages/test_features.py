@@ -6,12 +6,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
-from pipeline import Given, Run
+from pipeline import BadInput, Given, Run
 from stages.features import FeatureSettings, _check, _sheet, features
 from stages.formats import read_clip, read_features, read_json
 from stages.perception.descriptors import crop_box, crop_resize, describe_appearance, match_trust
 from stages.perception.sheets import feature_colours, flow_colours, frame_sheet, mask_sheet, tile
+from synthetic.clips import film, make_subject
 from tests.stages.perception_clips import moving_clip, write_frames_folder, write_masks_folder
 
 IMAGES, TRUTH, _ = moving_clip(6, 128)
@@ -24,7 +26,8 @@ def test_stage(tmp_path: Path) -> None:
     masks = write_masks_folder(tmp_path / "masks", truth, read_clip(frames.path))
     out = tmp_path / "out"
     out.mkdir()
-    features(frames=frames, masks=masks, given=Given(), settings=FeatureSettings(), out=out, run=Run())
+    settings = FeatureSettings(category="other")
+    features(frames=frames, masks=masks, given=Given(), settings=settings, out=out, run=Run())
     _check(out=out, frames=frames)
     values, crops = read_features(out)
     assert values.dtype == np.float16 and values.shape == (6, 112, 112, 16)
@@ -34,9 +37,44 @@ def test_stage(tmp_path: Path) -> None:
     np.testing.assert_allclose(share[0], TRUTH[0].sum() / box, rtol=0.1)
     assert share[3] == 0
     info = read_json(out / "features.json")
-    assert info["network"] == "builtin-appearance" and 0 <= info["trust"] <= 1
+    assert info["network"] == "builtin-appearance" and info["category"] == "other" and 0 <= info["trust"] <= 1
     _sheet(out=out, picture=tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").stat().st_size > 1000
+
+
+def test_an_animal_is_known_and_embedded_by_our_network(tmp_path: Path) -> None:
+    clip = film(make_subject(41, "dog"), clip=0, clips=3, frames=4, size=96, seed=3, fps=4)
+    frames = write_frames_folder(tmp_path / "frames", clip.images)
+    masks = write_masks_folder(tmp_path / "masks", clip.masks, read_clip(frames.path))
+    out = tmp_path / "out"
+    out.mkdir()
+    features(frames=frames, masks=masks, given=Given(), settings=FeatureSettings(), out=out, run=Run())
+    _check(out=out, frames=frames)
+    info = read_json(out / "features.json")
+    assert info["category"] == "quadruped" and info["network"] == "posenet-quadruped.onnx" and 0 < info["margin"] <= 1
+    assert info["category_named"]["quadruped"] > info["category_named"]["human"]
+    values, crops = read_features(out)
+    # The same points of the surface are nearer to each other, from frame to frame, than others are.
+    places = {}
+    for i in (0, 1):
+        pixel = (
+            clip.intrinsics
+            @ (clip.camera_from_object[i] @ np.append(clip.joints[i], np.ones((len(clip.joints[i]), 1)), 1).T)[:3]
+        )
+        cell = (pixel[:2] / pixel[2] - crops[i][:2, None]) * 112 / (crops[i][2] - crops[i][0])
+        places[i] = np.clip(cell.T.astype(int), 0, 111)
+    a, b = (np.asarray(values[i], np.float32)[places[i][:, 1], places[i][:, 0]] for i in (0, 1))
+    on = (np.abs(a).sum(1) > 0) & (np.abs(b).sum(1) > 0)
+    alike = a[on] @ b[on].T
+    assert on.sum() >= 10 and np.diag(alike).mean() > alike.mean() + 0.1
+
+
+def test_unknown_category_is_refused(tmp_path: Path) -> None:
+    frames = write_frames_folder(tmp_path / "frames", IMAGES)
+    masks = write_masks_folder(tmp_path / "masks", TRUTH, read_clip(frames.path))
+    with pytest.raises(BadInput, match="category is 'bird'"):
+        settings = FeatureSettings(category="bird")
+        features(frames=frames, masks=masks, given=Given(), settings=settings, out=tmp_path, run=Run())
 
 
 def test_crop_is_square_and_centred() -> None:
