@@ -1,7 +1,7 @@
 """flow: where each pixel goes, forward and backward, at several distances in time.
 
 Who answers, first to last: `clip.flow/` beside the video (the same layout: `fw-01/00000.png` ... in KITTI's format, or
-`.npy`), the ONNX network that the settings name, DIS (OpenCV) on the object alone, long steps started from chained
+`.npy`), the ONNX network that the settings name, DIS (OpenCV) on the whole frames, long steps started from chained
 short ones.
 """
 
@@ -102,10 +102,11 @@ def _provider(
     clip: Clip, settings: FlowSettings, steps: tuple[int, ...], run: Run
 ) -> tuple[str, Iterator[FlowPair]]:
     if settings.network:
-        network = FlowNetwork(Path(settings.network), settings.network_contract, device=run.device, threads=run.threads)
-        run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
+        network = FlowNetwork(settings.network, settings.network_contract, device=run.device, threads=run.threads)
+        run.log.info("%s on %s", network.name, network.on)
+        run.metric("network", f"{network.name} on {network.on}")
         images = clip.images()
-        return network.path.name, direct_pairs(images, steps, network)
+        return network.name, direct_pairs(images, steps, network)
     grey = np.stack([cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY) for i in range(len(clip))])
     matcher = Matcher(settings.quality)
     chain = Chain(grey, matcher, Matcher("fine") if settings.quality == "medium" else matcher)
