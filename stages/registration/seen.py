@@ -13,13 +13,15 @@ from stages.registration.placing import OBJECT_SIZE, smooth, view_rotation
 from stages.registration.tracking import elevation_step, forward_backward, turning_posterior
 from stages.registration.turning import expected_turns
 
-FRAME_WEIGHT = 0.3
-"""What one frame's opinion counts: neighbours look alike, and err alike."""
+FRAME_WEIGHT = 0.15
+"""What one frame counts: neighbours look alike, so a mistake lasts for a second rather than for a frame."""
 DOUBT = 0.1
 """How likely a frame's opinion is to be worth nothing."""
 TURN_SHARE = 0.7
 TURN_SIGMA = 0.06
 """A turn from frame to frame is this share of what the flow suggests, give or take the latter, radians."""
+LEAST_MATCHED = 0.1
+"""Mean confidence of the flow on the object below which it says nothing of a turn."""
 TILT_SIGMA = np.radians(1.0)
 """Change of elevation and roll from frame to frame, radians."""
 AGREEMENT = np.pi / 4
@@ -46,7 +48,10 @@ def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarra
     say = FRAME_WEIGHT * np.where(cues.known, np.where(cues.cut, 0.5, 1.0), 0.0)[:, None]
     azimuth = say * np.logaddexp(view.azimuth, np.log(DOUBT / view.azimuth.shape[1]))
     turn = TURN_SHARE * expected_turns(cues)[:-1]
-    posterior, bins = turning_posterior(azimuth, view.azimuth_bins, turn, TURN_SIGMA)
+    object_px = cues.mask > 0.5
+    matched = (cues.flow_confidence * object_px).sum(axis=(1, 2)) / np.maximum(object_px.sum(axis=(1, 2)), 1)
+    sigma = np.where(matched[:-1] > LEAST_MATCHED, TURN_SIGMA, np.pi)
+    posterior, bins = turning_posterior(azimuth, view.azimuth_bins, turn, sigma)
     mean = posterior @ np.exp(1j * bins)
     tilt = [_steady(say * p, b) for p, b in ((view.elevation, view.elevation_bins), (view.roll, view.roll_bins))]
     return smooth(np.unwrap(np.angle(mean)), 2.0), smooth(tilt[0], 2.0), smooth(tilt[1], 2.0), np.abs(mean)

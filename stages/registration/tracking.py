@@ -69,12 +69,14 @@ AZIMUTHS = 90
 RATES = np.radians(np.linspace(-6.0, 6.0, 25))
 RATE_MEMORY = np.radians(0.2)
 """Change of the turn rate from frame to frame, radians: bodies and cameras have inertia."""
+NO_JUMP = 1e-60
+"""Keeps products of probabilities above zero; far too small to let a clip jump from one side to the other."""
 RATE_REST = np.radians(18.0)
 """Turn rates above this, radians a frame, become unlikely."""
 
 
 def turning_posterior(
-    log_likelihood: np.ndarray, azimuth: np.ndarray, turn: np.ndarray, turn_sigma: float
+    log_likelihood: np.ndarray, azimuth: np.ndarray, turn: np.ndarray, turn_sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Posterior (T, 90) of the azimuth of an object that turns with inertia, and the angles of its bins (90,).
 
@@ -83,7 +85,7 @@ def turning_posterior(
 
     Args:
         log_likelihood: (T, A) at `azimuth` (A,), equal bins once round, radians.
-        turn: (T - 1,) observed turn to the next frame, radians, with standard deviation `turn_sigma`.
+        turn: (T - 1,) observed turn to the next frame, radians, with standard deviations `turn_sigma` (T - 1,).
     """
     bins = np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS
     order = np.argsort(azimuth % (2 * np.pi))
@@ -92,7 +94,7 @@ def turning_posterior(
     likelihood = np.exp(read - read.max(axis=1, keepdims=True))[:, :, None]
     change = np.exp(-0.5 * ((RATES[None] - RATES[:, None]) / RATE_MEMORY) ** 2 - 0.5 * (RATES[None] / RATE_REST) ** 2)
     change /= change.sum(axis=1, keepdims=True)
-    seen = np.exp(-0.5 * ((RATES[None] - np.asarray(turn)[:, None]) / turn_sigma) ** 2) + 1e-6
+    seen = np.exp(-0.5 * ((RATES[None] - turn[:, None]) / turn_sigma[:, None]) ** 2) + 1e-6
     wave = np.fft.rfftfreq(AZIMUTHS, 1 / AZIMUTHS)
     shift = np.exp(-1j * wave[:, None] * RATES[None])  # turning by a rate, bins or not, is a phase
 
@@ -106,12 +108,12 @@ def turning_posterior(
         if t:
             state = move(forward[t - 1] * seen[t - 1], shift) @ change
         state = state * likelihood[t]
-        forward[t] = state / state.sum() + 1e-12
+        forward[t] = state / state.sum() + NO_JUMP
     posterior = forward.copy()
     ahead = np.ones_like(state)
     for t in range(count - 2, -1, -1):
         ahead = move((ahead * likelihood[t + 1]) @ change.T, shift.conj()) * seen[t]
-        ahead = ahead / ahead.sum() + 1e-12
+        ahead = ahead / ahead.sum() + NO_JUMP
         posterior[t] *= ahead
     share = posterior.sum(axis=2)
     return share / share.sum(axis=1, keepdims=True), bins

@@ -52,7 +52,7 @@ def _subject(azimuth: np.ndarray, wrong: np.ndarray) -> Subject:
 
 def test_the_posterior_is_a_distribution_and_follows_a_clear_path() -> None:
     path = np.radians(np.linspace(-150, 250, 120))
-    posterior, bins = turning_posterior(_log(BINS, path, 12.0), BINS, np.diff(path), 0.1)
+    posterior, bins = turning_posterior(_log(BINS, path, 12.0), BINS, np.diff(path), np.full(119, 0.1))
     assert np.allclose(posterior.sum(axis=1), 1)
     found = np.angle(posterior @ np.exp(1j * bins))
     assert np.degrees(np.abs(np.angle(np.exp(1j * (found - path))))).max() < 12
