@@ -31,14 +31,15 @@ from stages.formats import (
     write_image,
     write_mask_facts,
 )
-from stages.networks import NO_FILE, PromptedMaskNetwork
+from stages.networks import NO_FILE, PromptedMaskNetwork, mask_network
+from stages.own_networks import CATEGORIES, OwnNetwork
 from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
+from stages.perception.prior import object_prior
 from stages.perception.prompts import Prompt, prompts_of
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
 from stages.perception.temporal import area_steadiness, describe
-from stages.slots import mask_network
 
 ASPECT_TOLERANCE = 0.02
 HINT_KEYS = {"frame", "time_s", "box", "inside", "outside"}
@@ -50,6 +51,8 @@ class MaskSettings:
 
     threshold: float = 0.5
     """Probability above which a pixel counts as the object, for boxes, areas and flags."""
+    category: str = "auto"
+    """quadruped or human: a network of ours that knows it helps; other: none does; auto: whichever fits what moves."""
     self_training_steps: int = 300
     """Steps in which the built-in segmentation fits its small network to the clip; 0 leaves that network out."""
     seed: int = 0
@@ -77,12 +80,28 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
         effort = Effort(network_steps=settings.self_training_steps, seed=settings.seed)
-        result = segment(clip.images(), hints, effort, tick=_ticker(run))
+        images = clip.images()
+        priors = _priors(images, settings.category, run)
+        result = segment(images, hints, effort, tick=_ticker(run), priors=priors)
+        run.metric("category_prior", result.prior or "none")
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
     facts = _facts(provider, result, clip, settings.threshold)
     write_mask_facts(out, facts, clip)
     _report(facts, settings, run, clip)
+
+
+def _priors(images: np.ndarray, category: str, run: Run) -> dict[str, np.ndarray]:
+    """Each category network's idea of the object, (T, H, W) uint8; only the named one's if the settings name it."""
+    if category not in ("auto", "other", *CATEGORIES):
+        known = ", ".join(("auto", *CATEGORIES, "other"))
+        raise BadInput(f"masks.category is {category!r}", hint=f"known: {known}")
+    wanted = {"auto": CATEGORIES, "other": ()}.get(category, (category,))
+    found = {}
+    for name in wanted:
+        run.tick(len(found), len(wanted), label=f"looking for a {name}")
+        found[name] = object_prior(images, OwnNetwork(name, device=run.device, threads=run.threads))
+    return found
 
 
 def _ticker(run: Run) -> Callable[[int, int, str], None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ import torch
 
 from pipeline import BadInput, Folder, Given, Resources, Run, Scene, stage
 from stages import formats
-from stages.registration.answer import Answer, Provider, Subject
+from stages.own_networks import CATEGORIES, OwnNetwork
+from stages.perception.viewpoint import AZIMUTH_DEG, ELEVATION_DEG, ROLL_DEG, angle_log_probabilities
+from stages.registration.answer import Answer, Provider, Subject, ViewBelief
 from stages.registration.combine import combine
 from stages.registration.cues import CROP_MARGIN, Cues, crop_embedding, crop_frame, principal_directions
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
@@ -26,6 +28,7 @@ from stages.registration.placing import (
     transforms,
 )
 from stages.registration.search import search
+from stages.registration.seen import seen
 from stages.registration.sheets import draw_pose, pose_sheet
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
@@ -36,10 +39,14 @@ APPEARANCE_ONLY = "builtin-appearance"
 """What features.json calls an embedding made of colours and edges, which the search sees anyway."""
 LOW_TRUST = 0.5
 GIVEN = ".poses.json"
-PROVIDERS: dict[str, Provider] = {"search": search, "colmap": structure_from_motion, "upright": upright}
-"""Providers by name, best first; `auto` takes the answers that are trusted most (see combine)."""
-LAST_RESORTS = ("colmap", "upright")
-"""Providers that `auto` asks only where the ones before left doubt."""
+PROVIDERS: dict[str, Provider] = {
+    "network": seen,
+    "search": search,
+    "colmap": structure_from_motion,
+    "upright": upright,
+}
+"""Providers by name, best first. `auto` asks one after the other until no clip is left in doubt, and takes the answers
+that are trusted most (see combine)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class PosesSettings:
     """Settings of the `poses` stage."""
 
     provider: str = "auto"
-    """auto, given (refuse to guess), search, colmap or upright."""
+    """auto, given (refuse to guess), network (a category's own), search (any object), colmap or upright."""
     focal_px: float = 0.0
     """Focal length in pixels of the kept frames; 0 takes the file's own hint, or else the longer side."""
     refine: bool = False
@@ -83,9 +90,11 @@ def poses(
     answers: dict[str, Answer] = {}
     if asked:
         basis = _embedding_basis(features)
-        subjects = [
-            _subject(n, clips[n], masks[n], flow[n], features[n], basis, settings, tracks.get(n), run) for n in clips
-        ]
+        network = _network(features, run)
+        subjects = []
+        for n in clips:
+            subject = _subject(n, clips[n], masks[n], flow[n], features[n], basis, settings, tracks.get(n), run)
+            subjects.append(subject if network is None else replace(subject, view=_view(clips[n], masks[n], network)))
         answers, tried = _ask(subjects, asked, settings, run)
         tracks |= {s.name: _track(s, answers[s.name]) for s in subjects if s.name in answers}
     for name, clip in clips.items():
@@ -105,7 +114,7 @@ def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
             raise PoseDocumentError("is not a JSON object with K and object_to_camera")
         matrices = parse_transforms(document, len(clip.source_time_s))
         intrinsics = parse_intrinsics(document)
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, PoseDocumentError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         what = str(error) if isinstance(error, PoseDocumentError) else f"cannot be read as JSON ({error})"
         raise BadInput(
             f"{path.name} {what}", hint="give K and one rigid 4x4 object_to_camera a source frame"
@@ -130,6 +139,36 @@ def _embedding_basis(features: dict[str, Folder]) -> np.ndarray | None:
         samples.append(some[np.abs(some).sum(axis=1) > 0])
     together = np.concatenate(samples)
     return principal_directions(together, EMBEDDING_CHANNELS) if len(together) > 100 else None
+
+
+def category_of(verdicts: list[dict[str, Any]]) -> str:
+    """The category that most clips' features.json name, each weighted by its margin; "other" if none is ours."""
+    votes: dict[str, float] = {}
+    for verdict in verdicts:
+        name = str(verdict.get("category", "other"))
+        votes[name] = votes.get(name, 0.0) + 0.05 + max(float(verdict.get("margin", 0.0)), 0.0)
+    best = max(votes, key=lambda name: votes[name])
+    return best if best in CATEGORIES else "other"
+
+
+def _network(features: dict[str, Folder], run: Run) -> OwnNetwork | None:
+    """The view network of the collection's category; None where we have none."""
+    category = category_of([formats.read_json(folder / "features.json") for folder in features.values()])
+    run.metric("category", category)
+    return None if category == "other" else OwnNetwork(category, device=run.device, threads=run.threads)
+
+
+def _view(clip: formats.Clip, masks: Folder, network: OwnNetwork, chunk: int = 32) -> ViewBelief:
+    """What the network makes of every frame; its azimuth is the object's turn, ours the camera's bearing."""
+    probability = formats.read_masks(masks.path, clip)
+    parts = []
+    for start in range(0, len(clip), chunk):
+        images = np.stack([clip.image(i) for i in range(start, min(start + chunk, len(clip)))])
+        parts.append(angle_log_probabilities(images, probability[start : start + chunk], network))
+    azimuth, elevation, roll = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return ViewBelief(
+        azimuth, elevation, roll, -np.radians(AZIMUTH_DEG), np.radians(ELEVATION_DEG), np.radians(ROLL_DEG)
+    )
 
 
 def _subject(
@@ -193,8 +232,8 @@ def _ask(
             run.interrupt()
 
     for provider in dict.fromkeys(names):
-        answered = [a[n].trust for a in answers for n in asked if n in a]
-        if provider in LAST_RESORTS and len(answered) >= len(asked) and min(answered) >= LOW_TRUST:
+        answered = [max(a[n].trust for a in answers if n in a) for n in asked if any(n in a for a in answers)]
+        if len(answered) >= len(asked) and min(answered) >= LOW_TRUST:
             continue
         found = PROVIDERS[provider](subjects, settings.seed, tell)
         answers.append(found)

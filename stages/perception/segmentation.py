@@ -26,6 +26,8 @@ from stages.perception.temporal import flow_median, main_component
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
 CARRY_SIDE_PX = 128
+LEAST_PRIOR_AREA = 2e-3
+LEAST_PRIOR_SCORE = 0.35
 OUTLINE_REACH_PX = 4.0  # at the working size
 Tick = Callable[[int, int, str], None]
 
@@ -46,6 +48,7 @@ class Segmentation:
 
     probability: np.ndarray
     agreement: np.ndarray
+    prior: str = ""  # the category whose network had a say
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,12 @@ def segment(
     hints: tuple[Hint, ...] = (),
     effort: Effort | None = None,
     tick: Tick = lambda done, total, label: None,
+    priors: dict[str, np.ndarray] | None = None,
 ) -> Segmentation:
-    """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB."""
+    """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB.
+
+    `priors` are category networks' ideas of it, (T, H, W) uint8 each; the one that fits what moves has a say.
+    """
     effort = effort or Effort()
     work = [shrink(image, WORK_SIDE_PX) for image in images]
     cues = motion_cues(work, tick=lambda done: tick(done, len(work), "motion"))
@@ -100,13 +107,17 @@ def segment(
     told = hint_evidence(hints, images.shape[1:3], work[0].shape[:2], len(work))
     if hints:
         told = carrier.spread(told, 0.93, strongest=False)
+    chosen = choose_prior(priors or {}, cues)
+    if chosen:
+        told = told + prior_evidence((priors or {})[chosen], work[0].shape[:2])
     soft = coarse_probability(work, cues, told, carrier, effort)
     tick(1, 3, "learning")
     soft = tight_probability(work, soft, cues, told, effort)
     tick(2, 3, "learning")
     soft = network_probability(work, soft, told, effort)
     tick(3, 3, "learning")
-    return finish(images, soft, carrier)
+    found = finish(images, soft, carrier)
+    return Segmentation(found.probability, found.agreement, chosen)
 
 
 # --------------------------------------------------------------------------------------------- the steps
@@ -237,6 +248,29 @@ def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[in
             for x, y in points * scale:
                 layer[np.hypot(columns - x, rows - y) <= reach] = value
     return out
+
+
+def choose_prior(priors: dict[str, np.ndarray], cues: MotionCues) -> str:
+    """Name of the prior (T, H, W) uint8 that is surest of itself and covers what moves; "" if none does."""
+    best, best_score = "", 0.0
+    for name, prior in sorted(priors.items()):
+        maps = _resized(prior, cues.evidence.shape[2], cues.evidence.shape[1]) / 255
+        inside = maps > 0.5
+        present = float((inside.reshape(len(maps), -1).mean(axis=1) > LEAST_PRIOR_AREA).mean())
+        sure = float(maps[inside].sum() / max(np.count_nonzero(maps > 0.2), 1))
+        moving = np.clip(cues.evidence / 1.5, 0, 1) * (cues.moving > 0.3)
+        wide = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((9, 9), np.uint8)) for m in inside])
+        covered = float((moving * wide).sum() / moving.sum()) if moving.sum() > LEAST_PRIOR_AREA * moving.size else 1.0
+        score = present * sure * min(covered / 0.5, 1.0)
+        if score > max(best_score, LEAST_PRIOR_SCORE):
+            best, best_score = name, score
+    return best
+
+
+def prior_evidence(prior: np.ndarray, work: tuple[int, ...]) -> np.ndarray:
+    """(T, h, w) log-odds, within +-3, of a prior (T, H, W) uint8."""
+    share = _resized(prior, work[1], work[0]) / 255
+    return np.clip(np.log((share + 0.03) / (1.03 - share)), -3.0, 3.0).astype(np.float32)
 
 
 def _resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
