@@ -84,7 +84,7 @@ def row(
     return np.concatenate([p[top:bottom, left:right] for p in pictures], 1)
 
 
-def sheet(model: Banmo, videos: list[Path], width_px: int = 900) -> np.ndarray:
+def sheet(model: Banmo, videos: list[Path], width_px: int = 640) -> np.ndarray:
     """One row a clip; RGB uint8."""
     from skimage.measure import marching_cubes
     from skimage.transform import resize
