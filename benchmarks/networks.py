@@ -37,8 +37,9 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import random_body, render_views, view_rotation
 from synthetic.canonical import Carrier, canonical_body, mirror_vertices
 from synthetic.things import PLACES, place_labels, places
-from training.dressing import Bank, Batch, Random, dress
+from training.dressing import Batch, dress
 from training.losses import network_input
+from training.wardrobe import Bank, Random
 
 HELD_OUT_SEED = 900
 

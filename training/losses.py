@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from training.dressing import Batch, Random
+from training.dressing import Batch
 from training.network import (
     AZIMUTH_DEG,
     AZIMUTHS,
@@ -18,6 +18,7 @@ from training.network import (
     IMAGENET_STD,
     ROLL_DEG,
 )
+from training.wardrobe import Random
 
 AZIMUTH_SPREAD_DEG, ANGLE_SPREAD_DEG = 7.0, 6.0
 NEAR = 0.09

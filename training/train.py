@@ -24,9 +24,10 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import Shard
 from synthetic.canonical import canonical_body, laplacian_basis, mirror_vertices
 from synthetic.things import PLACES, places
-from training.dressing import Bank, Batch, Random, dress
+from training.dressing import Batch, dress
 from training.losses import Surface, mask_loss, network_input, view_blocks, view_loss
 from training.network import AZIMUTH_DEG, CATEGORIES, Network
+from training.wardrobe import Bank, Random
 
 log = logging.getLogger(__name__)
 

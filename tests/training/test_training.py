@@ -14,7 +14,7 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import NOTHING, PARTS, SIDE_PX, Shard, random_body, render_views, view_rotation
 from synthetic.bank import main as write_bank
 from synthetic.canonical import Carrier, canonical_body
-from training.dressing import Bank, Random, dress
+from training.dressing import dress
 from training.export import export
 from training.losses import (
     Surface,
@@ -27,6 +27,7 @@ from training.losses import (
 )
 from training.network import AZIMUTH_DEG, CATEGORIES, ELEVATION_DEG, INPUT_PX, ROLL_DEG, Network
 from training.train import load_bank, train
+from training.wardrobe import Bank, Random
 
 
 @pytest.fixture(scope="module")
