@@ -24,6 +24,7 @@ HEAD = """\
 OWN_HELP = {
     "pipeline": "What to reconstruct.",
     "execution": "How to run. Nothing here changes a result.",
+    "store": "Where else results may be. Nothing here changes a result.",
 }
 UNITS = {"px": "pixels", "deg": "degrees", "s": "seconds", "minutes": "minutes", "fps": "frames a second"}
 
