@@ -7,7 +7,7 @@ from stages.registration.answer import Subject, ViewBelief
 from stages.registration.cues import Cues
 from stages.registration.placing import view_angles
 from stages.registration.search import resample_bearing
-from stages.registration.seen import seen, view_path
+from stages.registration.seen import seen, view_path, with_habit
 from stages.registration.tracking import turning_posterior
 
 BINS = np.radians(np.arange(-175.0, 180.0, 10.0))
@@ -96,3 +96,11 @@ def test_bearings_are_read_between_bins_and_round_the_circle() -> None:
     read = resample_bearing(subject.view, np.array([0, 1]), fine)
     assert np.degrees(fine[read.argmax(axis=1)]) == pytest.approx([180.0, 270.0], abs=5)
     assert read.max(axis=1) == pytest.approx([0.0, 0.0])
+
+
+def test_an_unsure_elevation_leans_to_the_usual_and_a_steep_one_stays_steep() -> None:
+    bins = np.radians(np.arange(-25.0, 90.0, 10.0))
+    said = _log(bins, np.radians(np.array([5.0, 75.0])), 4.0, periodic=False)
+    low, steep = np.degrees((np.exp(with_habit(said, bins)) * bins).sum(axis=1))
+    assert 8 < low < 15
+    assert steep > 60
