@@ -114,7 +114,7 @@ train-networks: $(STAMP)  ## train the shipped networks anew: renderings, MINUTE
 	$(PYTHON) -m synthetic.bank build/bank --category human --bodies 180 --views 100 --seed 1
 	$(PYTHON) -m synthetic.bank build/bank --category thing --bodies 120 --views 25 --seed 1
 	$(PYTHON) -m training.train build/networks --bank build/bank --minutes "$(MINUTES)" --seed 0
-	$(PYTHON) -m training.export build/networks/state.pt build/networks/weights
+	$(PYTHON) -m training.export build/networks/state.safetensors build/networks/weights
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code
 	$(PYTHON) docs/generate.py

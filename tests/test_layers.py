@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PRODUCT = ("pipeline", "stages", "synthetic", "benchmarks", "workspace_template")
+PRODUCT = ("pipeline", "stages", "synthetic", "training", "benchmarks", "workspace_template")
 MOST_LINES = 500
 PICKLE = {"pickle", "cPickle", "dill", "joblib", "shelve", "cloudpickle"}
 

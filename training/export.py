@@ -1,6 +1,6 @@
 """Write trained networks as ONNX files, and the canonical surfaces as .npz.
 
-``python -m training.export STATE.pt OUT_DIR``
+``python -m training.export STATE.safetensors OUT_DIR``
 
 For every category: ``cse-<category>.onnx`` (picture 1x3xHxW, normalised by ImageNet's mean and deviation, H and W
 multiples of 16 -> 17 channels at half the size: mask logit, then a 16-D embedding of unit length),
@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from synthetic.canonical import canonical_body
 from training.losses import Surface
 from training.network import CATEGORIES, EMBEDDING, INPUT_PX, VIEW_OUTPUTS, Network
-from training.train import make_surface
+from training.train import make_surface, read_state
 
 log = logging.getLogger(__name__)
 
@@ -183,7 +183,7 @@ def posenet_model(network: Network, category: int, provenance: dict[str, str]) -
 
 def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]:
     """Write all files; returns their sha256 by name."""
-    saved = torch.load(state, weights_only=True, map_location="cpu")
+    saved = read_state(state)
     network = Network().eval()
     network.load_state_dict(saved["network"])
     surfaces = nn.ModuleList(make_surface(name, 0) for name in CATEGORIES)
@@ -224,7 +224,7 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
     """Write trained networks as ONNX files.
 
     Args:
-        state: The `state.pt` of a training run; its `log.jsonl` lies beside it.
+        state: The `state.safetensors` of a training run; its `log.jsonl` lies beside it.
         out: Folder to write to.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")

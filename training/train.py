@@ -2,8 +2,8 @@
 
 ``python -m training.train OUT_DIR --bank BANK_DIR --minutes 75 --seed 0``
 
-One run trains the shared trunk and both categories. It is seeded, stops by the clock, writes ``state.pt`` every few
-minutes (weights averaged over the last steps) and one line of ``log.jsonl`` every 100 steps.
+One run trains the shared trunk and both categories. It is seeded, stops by the clock, writes ``state.safetensors``
+every few minutes (weights averaged over the last steps) and one line of ``log.jsonl`` every 100 steps.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Annotated
 
 import torch
 import tyro
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from synthetic.backgrounds import backgrounds
@@ -132,7 +133,7 @@ def train(
     each = [make_surface(name, seed + k) for k, name in enumerate(CATEGORIES)]
     surfaces = nn.ModuleList(each)
     if start is not None:
-        state = torch.load(start, weights_only=True, map_location="cpu")
+        state = read_state(start)
         network.load_state_dict(state["network"])
         surfaces.load_state_dict(state["surfaces"])
     network.to(device)
@@ -167,9 +168,9 @@ def train(
                 record.flush()
                 running = {}
             if time.monotonic() - kept > KEEP_EVERY_S:
-                keep(out / "state.pt", averaged, surfaces)
+                keep(out / "state.safetensors", averaged, surfaces)
                 kept = time.monotonic()
-    keep(out / "state.pt", averaged, surfaces)
+    keep(out / "state.safetensors", averaged, surfaces)
     return averaged, surfaces
 
 
@@ -191,10 +192,21 @@ def _average(averaged: nn.Module, network: nn.Module, keep_share: float) -> None
                 mine.copy_(theirs)
 
 
+def read_state(path: Path) -> dict[str, dict[str, Tensor]]:
+    """State dictionaries `network` and `surfaces`, as `keep` wrote them."""
+    state: dict[str, dict[str, Tensor]] = {"network": {}, "surfaces": {}}
+    for key, value in load_file(path).items():
+        name, _, rest = key.partition("/")
+        state[name][rest] = value
+    return state
+
+
 def keep(path: Path, network: nn.Module, surfaces: nn.Module) -> None:
     """Write both state dictionaries, whole or not at all."""
     part = path.with_suffix(".part")
-    torch.save({"network": network.state_dict(), "surfaces": surfaces.state_dict()}, part)
+    parts = {"network": network, "surfaces": surfaces}
+    flat = {f"{name}/{key}": v.cpu() for name, module in parts.items() for key, v in module.state_dict().items()}
+    save_file({key: value.contiguous() for key, value in flat.items()}, part)
     part.replace(path)
 
 
@@ -219,7 +231,7 @@ def main(
         batch: Pictures a step and category.
         threads: CPU threads.
         photos: How many backgrounds to make.
-        start: A `state.pt` to go on from.
+        start: A `state.safetensors` to go on from.
         device: Where the network is trained: cpu or cuda. Pictures are dressed on the CPU.
     """
     import numpy as np

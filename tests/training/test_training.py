@@ -26,7 +26,7 @@ from training.losses import (
     view_targets,
 )
 from training.network import AZIMUTH_DEG, CATEGORIES, ELEVATION_DEG, INPUT_PX, ROLL_DEG, Network
-from training.train import load_bank, train
+from training.train import load_bank, read_state, train
 from training.wardrobe import Bank, Random
 
 
@@ -157,10 +157,10 @@ def test_a_short_training_repeats_learns_and_is_written_as_onnx(
     for a, b in zip(networks[0].state_dict().values(), networks[1].state_dict().values(), strict=True):
         assert torch.equal(a, b)
     (tmp_path / "a" / "log.jsonl").write_text(json.dumps({"step": 3, "pictures": 24}) + "\n", encoding="utf-8")
-    digests = export(tmp_path / "a" / "state.pt", tmp_path / "out", {"made_by": "a test"})
+    digests = export(tmp_path / "a" / "state.safetensors", tmp_path / "out", {"made_by": "a test"})
     assert len(digests) == 6
     network = Network().eval()
-    network.load_state_dict(torch.load(tmp_path / "a" / "state.pt", weights_only=True)["network"])
+    network.load_state_dict(read_state(tmp_path / "a" / "state.safetensors")["network"])
     x = torch.randn(2, 4, INPUT_PX, INPUT_PX, generator=torch.Generator().manual_seed(0))
     wide = torch.randn(1, 3, 64, 128, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
