@@ -8,6 +8,7 @@ Traps of the cluster that this module answers:
   So a worker that stopped although nobody cancelled the job makes this process ask for a requeue, and wait for it.
 * The function that submitit pickles is a reference to a module that may have been edited since. The worker compares
   the fingerprint of the code in the request with its own and refuses to run other code under that key.
+* Slurm's warning signal reaches every process of the job, the workers too: they take it as the wish to stop.
 * Several tasks of a node see the same GPUs; each picks its own by LOCAL_RANK, as under torchrun.
 """
 
@@ -86,6 +87,7 @@ class RunRequest:
                 stderr=subprocess.STDOUT,
                 cwd=Path(self.request).parent,
                 env=environment,
+                preexec_fn=_ignore_warnings,
             )
 
     def _pass_on(self, *_: object) -> None:
@@ -104,6 +106,11 @@ class RunRequest:
         """Come again later; this process waits until Slurm ends it, because one that ends by itself is finished."""
         subprocess.run(["scontrol", "requeue", os.environ["SLURM_JOB_ID"]], timeout=60, check=False)
         time.sleep(_REQUEUE_S)
+
+
+def _ignore_warnings() -> None:
+    """In a worker about to start: Slurm's warning goes to every process of the job, and would end one by default."""
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
 
 
 def _job_facts(job_id: str) -> str:

@@ -256,7 +256,8 @@ class Worker:
 
     def _watch(self) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, lambda *_: self.context.request_stop())
+        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):  # the last two: a cluster's warnings
+            signal.signal(number, lambda *_: self.context.request_stop())
         if self.request.get("watch_parent"):
             threading.Thread(target=self._watch_parent, daemon=True).start()
 
