@@ -84,8 +84,8 @@ def _train(
     label: str,
 ) -> tuple[Trainer, list[dict[str, float]]]:
     """Train from the last checkpoint to the end; the leader of the team writes, all read. Returns metrics, too."""
-    device = model.base_poses.device
     trainer = Trainer(model, collection.observations, settings, team)
+    device = trainer.device
     history: list[dict[str, float]] = []
     saved = checkpoints.latest()
     if saved is not None:
