@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.meshing.gltf import RiggedMesh, linear_from_srgb, translation_rotation
+from stages.meshing.conversions import linear_from_srgb, translation_rotation
+from stages.meshing.gltf import RiggedMesh
 from stages.meshing.skeleton import Skeleton
 
 _CODES_PER_SECOND = 24.0
