@@ -6,6 +6,7 @@ are the fields of that stage's settings class. On the command line: ``--stage.ke
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import tomllib
@@ -102,6 +103,12 @@ class Settings:
         return StoreSection(**self.values["store"])
 
 
+@functools.cache
+def _own_fields() -> dict[str, tuple[dict[str, Any], ...]]:
+    """The fields of the engine's own sections; their help is read from the source, once."""
+    return {name: tuple(fields_of(kind)) for name, kind in _OWN.items()}
+
+
 def check_execution(found: ExecutionSection) -> None:
     """Raise BadInput for counts that cannot be."""
     for name, least in (("ranks", 1), ("nodes", 1), ("slurm_time_limit_min", 1), ("slurm_parallel", 1), ("cpus", 0)):
@@ -111,7 +118,7 @@ def check_execution(found: ExecutionSection) -> None:
 
 def sections(definition: Definition) -> dict[str, tuple[dict[str, Any], ...]]:
     """Every section and its fields. Stages that cannot be imported have no entry."""
-    found = {name: tuple(fields_of(kind)) for name, kind in _OWN.items()}
+    found = dict(_own_fields())
     for name, info in definition.stages.items():
         if not info.error:
             found[name] = info.fields

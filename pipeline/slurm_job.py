@@ -98,8 +98,8 @@ class RunRequest:
         """Whether somebody ended this job on purpose: the run that submitted it, or the user by scancel."""
         if (Path(self.request).parent / "stop").exists():
             return True
-        state = _job_facts(os.environ.get("SLURM_JOB_ID", ""))
-        return not state or "CANCELLED" in state or "TIMEOUT" in state
+        # A preempted job still counts as running in its time of grace; a cancelled one is completing at once.
+        return _job_facts(os.environ.get("SLURM_JOB_ID", "")) != "JobState=RUNNING"
 
     @staticmethod
     def _requeue() -> None:

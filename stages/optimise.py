@@ -74,7 +74,7 @@ class FitSettings(PhaseSettings):
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
     """At the end, move to the root poses what all bones share, so that the trunk rests in object space."""
-    lr_root: float = 1e-3
+    lr_root: float = 2e-4
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.5
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
@@ -132,7 +132,7 @@ class RefineSettings(PhaseSettings):
     """Frame steps of the optical flow that are used, both ways."""
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1, distributed=True))
 def fit(
     frames: dict[str, Folder],
     masks: dict[str, Folder],
@@ -160,7 +160,7 @@ def fit(
     run_phase(model, collection, settings, checkpoints, out, run, "fitting", settle_root=settings.settle_root)
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1, distributed=True))
 def correct(
     fit: Folder,
     frames: dict[str, Folder],
@@ -177,7 +177,7 @@ def correct(
     _continue(fit, collect(frames, masks, flow, features, poses, settings.flow_steps, run), settings, out, run)
 
 
-@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1))
+@stage(per=Scene, version=1, needs=Resources(cpus="all", gpus=1, distributed=True))
 def refine(
     correct: Folder,
     frames: dict[str, Folder],
