@@ -66,7 +66,8 @@ def compare(exports: Path, interpreter: Path, moments: int = 10) -> tuple[dict[s
         track = read_poses(exports / "cameras" / f"{name}.json")
         worst = 0.0
         for k, i in enumerate(chosen[name].tolist()):
-            ours = np.asarray(trimesh.load(exports / "meshes" / name / f"{i:05d}.ply", process=False).vertices)
+            mesh: Any = trimesh.load(exports / "meshes" / name / f"{i:05d}.ply", process=False)
+            ours = np.asarray(mesh.vertices)
             pose = track.object_to_camera[i]
             scene = (ours @ pose[:3, :3].T + pose[:3, 3]) * _GL_FROM_CV
             worst = max(worst, float(cKDTree(posed[name][k]).query(scene)[0].max()) / length)

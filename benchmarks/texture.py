@@ -13,6 +13,7 @@ import logging
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,8 +63,8 @@ class Textured:
 
 def read_textured(exports: Path) -> Textured:
     """The surface of ``model.glb`` with its texture, and the vertex colours of ``rest.ply`` at the same places."""
-    mesh = trimesh.load(exports / "model.glb", process=False, force="mesh")
-    rest = trimesh.load(exports / "rest.ply", process=False)
+    mesh: Any = trimesh.load(exports / "model.glb", process=False, force="mesh")
+    rest: Any = trimesh.load(exports / "rest.ply", process=False)
     picture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
     uv = np.asarray(mesh.visual.uv) * [1, -1] + [0, 1]  # trimesh turns v upward
     _, nearest = trimesh.proximity.cKDTree(np.asarray(rest.vertices)).query(np.asarray(mesh.vertices))

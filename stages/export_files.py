@@ -102,8 +102,8 @@ def write_turntable(
     look = _look(rig, colour, texture)
     sticks = rig.skeleton.sticks(joints)
     images = pictures.turntable(look, shown, sticks, frames, max(2, side_px // 2 * 2))
-    shown = run.progress(images, frames, "turntable")
-    write_video(out / "turntable.mp4", shown, np.arange(frames) / _TURNTABLE_FPS)
+    watched = run.progress(images, frames, "turntable")
+    write_video(out / "turntable.mp4", watched, np.arange(frames) / _TURNTABLE_FPS)
 
 
 def write_overlay(

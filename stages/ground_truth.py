@@ -15,6 +15,7 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -97,7 +98,7 @@ def frame_meshes(folder: Path, count: int) -> dict[int, Path]:
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a mesh file. Raises BadInput when it holds none."""
     try:
-        mesh = trimesh.load(path, process=False, force="mesh")
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # trimesh's readers raise whatever they stumble over
         raise BadInput(f"{path.name} cannot be read as a mesh ({error})", where=path.parent) from error

@@ -103,17 +103,16 @@ def _limbs(parent: np.ndarray) -> list[list[int]]:
 
 def _labels(kind: str, chains: list[list[int]], parts: list[_Part]) -> list[str | None]:
     tips = [parts[chain[-1]] for chain in chains]
+    named: list[str | None] = []
     if kind == "quadruped":
         feet = [tip.middle[2] for tip in tips if tip.lowest < _ON_THE_GROUND]
         middle = (min(feet) + max(feet)) / 2 if feet else 0.5
-        named = []
         for tip in tips:
             if tip.lowest < _ON_THE_GROUND:
                 named.append(f"leg_{'front' if tip.middle[2] > middle else 'back'}{_side(tip)}")
             else:
                 named.append("head" if tip.middle[2] > 0.75 else "tail" if tip.middle[2] < 0.25 else None)
         return named
-    named = []
     for chain, tip in zip(chains, tips, strict=True):
         if tip.lowest < _ON_THE_GROUND or (tip.middle[1] < 0.3 and parts[chain[0]].middle[1] < 0.6):
             named.append(f"leg{_side(tip)}")

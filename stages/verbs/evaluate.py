@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from stages.ground_truth import TrueSurfaces
+    from stages.scoring.metrics import SurfaceScore
     from stages.scoring.surfaces import Surface
 
 SUMMARY = "measure the result against known surfaces, poses, masks and flow"
@@ -128,7 +129,9 @@ def _score_all(args: argparse.Namespace, truth: TrueSurfaces, folder: Path, name
     from stages.scoring.surfaces import Surface
 
     cm, starts = REST_CM / truth.rest_edge, cube_rotations()
-    missing, drift, scores = {}, {}, {n: [] for n in names}
+    missing: dict[str, int] = {}
+    drift: dict[str, float] = {}
+    scores: dict[str, list[SurfaceScore]] = {n: [] for n in names}
     held: list[tuple[str, Surface, Surface]] = []
 
     def settle(frames: list[tuple[str, Surface, Surface]]) -> None:
@@ -141,7 +144,9 @@ def _score_all(args: argparse.Namespace, truth: TrueSurfaces, folder: Path, name
             similarity = align([p], [t], starts) if common is None else common
             edge = float(np.ptp(t.vertices, axis=0).max())
             scores[name].append(surface_score(p, t, similarity, edge, cm, args.distance))
-        for name in {n for n, _, _ in frames} if common is not None else ():
+        if common is None:
+            return
+        for name in {n for n, _, _ in frames}:
             own = [(p, t) for n, p, t in frames if n == name]
             if len({len(p.vertices) for p, _ in own}) == 1:
                 drift[name] = tracking_error_cm([p for p, _ in own], [t for _, t in own], common, cm)
