@@ -78,6 +78,10 @@ KINDS = {"cat": CAT, "dog": DOG, "fox": FOX, "horse": HORSE}
 """Named proportions."""
 
 
+STOUT = 0.4
+"""Share of stout bodies among quadrupeds at random."""
+
+
 def vary_quadruped(rng: np.random.Generator) -> QuadrupedShape:
     """Any quadruped: from the proportions of a cat, a dog or a horse, far enough to meet what none of them is like."""
     start = (CAT, DOG, HORSE, DOG)[int(rng.integers(4))]
@@ -93,6 +97,20 @@ def vary_quadruped(rng: np.random.Generator) -> QuadrupedShape:
         tail_pitch_deg=float(rng.uniform(-65, 75)),
         neck_pitch_deg=float(rng.uniform(15, 65)),
     )
+    if rng.random() < STOUT:  # thick fur and a round belly on short legs, as cats at home have them
+        round_ = float(rng.uniform(1.15, 1.7))
+        shape = replace(
+            shape,
+            chest=shape.chest * round_,
+            belly=shape.belly * round_ * float(rng.uniform(0.95, 1.2)),
+            haunch=shape.haunch * float(rng.uniform(1.0, 1.45)),
+            neck_girth=shape.neck_girth * float(rng.uniform(1.0, 1.6)),
+            limb=shape.limb * float(rng.uniform(1.0, 1.7)),
+            leg=shape.leg * float(rng.uniform(0.85, 1.2)),
+            neck=shape.neck * float(rng.uniform(0.6, 1.0)),
+            skull=shape.skull * float(rng.uniform(1.0, 1.4)),
+            stance=shape.stance * float(rng.uniform(1.0, 1.5)),
+        )
     return replace(shape, muzzle_girth=shape.skull * float(rng.uniform(0.38, 0.72)))
 
 
