@@ -304,7 +304,7 @@ def read_poses(path: Path) -> PoseTrack:
             confidence=np.array(info.get("confidence", [1.0] * len(poses)), np.float64),
             provider=list(info.get("provider", ["given"] * len(poses))),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path.name}: {error!r} missing or malformed") from error
     if not (len(track.object_to_camera) == len(track.confidence) == len(track.provider)):
         raise FormatError(f"{path.name}: lists of different lengths")

@@ -225,7 +225,7 @@ def read_hints(path: Path | None, clip: Clip) -> tuple[Hint, ...]:
         return ()
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"{path.name} cannot be read as TOML ({error})") from error
     rows = table.get("hint", [])
     if set(table) - {"hint"} or not isinstance(rows, list) or not rows:
@@ -248,7 +248,7 @@ def _hint(row: dict[str, Any], number: int, name: str, clip: Clip, scale: np.nda
             frame_idx = int(np.argmin(np.abs(clip.time_s - float(row["time_s"]))))
         box = np.array(row["box"], float).reshape(4) * np.tile(scale, 2) if "box" in row else None
         points = {k: np.array(row.get(k, []), float).reshape(-1, 2) * scale for k in ("inside", "outside")}
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadInput(
             f"{where}: box is [x0, y0, x1, y1], inside and outside are lists of [x, y], in pixels"
         ) from error

@@ -114,7 +114,7 @@ def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
             raise PoseDocumentError("is not a JSON object with K and object_to_camera")
         matrices = parse_transforms(document, len(clip.source_time_s))
         intrinsics = parse_intrinsics(document)
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, OverflowError, RecursionError) as error:
         what = str(error) if isinstance(error, PoseDocumentError) else f"cannot be read as JSON ({error})"
         raise BadInput(
             f"{path.name} {what}", hint="give K and one rigid 4x4 object_to_camera a source frame"
