@@ -355,3 +355,26 @@ def test_reader(name: str, place: Path, capsys: pytest.CaptureFixture[str]) -> N
         with capsys.disabled():
             sys.stdout.write(f"\n{name:<14} {count} inputs, {accepted} accepted, {refused} refused\n")
     assert count == COUNT or "BANMO_FUZZ" in os.environ, "the quick mode has time for all of them"
+
+
+BEYOND = b"9" * 400
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("given poses", b'{"K": ' + b"[" * 3000),
+        ("given poses", POSES.replace(b"3.0", BEYOND)),
+        ("given poses", POSES.replace(b"50", BEYOND)),
+        ("stored poses", POSES.replace(b"3.0", BEYOND)),
+        ("hints", b"[[hint]]\nframe = " + BEYOND + b"\nbox = [2, 2, 20, 15]\n"),
+        ("hints", b"[[hint]]\nframe = 0\nbox = [2, 2, " + BEYOND + b", 15]\n"),
+    ],
+)
+def test_found_by_fuzzing(name: str, data: bytes, place: Path) -> None:
+    """What the long mode has found stays refused in a sentence."""
+    reader = reader_of(name, place)
+    path = place / f"found{reader.suffix}"
+    path.write_bytes(data)
+    with pytest.raises(reader.says_no):
+        reader.read(path)
