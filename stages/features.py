@@ -71,8 +71,8 @@ def features(frames: Folder, masks: Folder, given: Given, settings: FeatureSetti
         network = FeatureNetwork(
             Path(settings.network), settings.network_contract, device=run.device, threads=run.threads
         )
-        run.log.info("%s on %s", network.path.name, ", ".join(network.providers))
-        provider, values = network.path.name, _described(clip, masks, crops, _by_slot(network), run)
+        run.log.info("%s on %s", network.name, network.on)
+        provider, values = network.name, _described(clip, masks, crops, _by_slot(network), run)
     elif verdict.category in own:
         ours = own[verdict.category]
         run.log.info("%s on %s", ours.name, ", ".join(ours.providers))
