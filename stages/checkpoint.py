@@ -60,7 +60,7 @@ class Checkpoints:
             "history": history,
         }
         for name, content in (("state.safetensors", data), ("state.json", json.dumps(facts).encode())):
-            with open(scratch / name, "wb") as file:
+            with (scratch / name).open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())

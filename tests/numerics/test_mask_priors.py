@@ -1,4 +1,4 @@
-"""A category network's idea of the object counts where it fits what moves, and tells colours apart where motion cannot."""
+"""A category network's idea of the object counts where it fits what moves."""
 
 import numpy as np
 import pytest
