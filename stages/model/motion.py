@@ -63,7 +63,9 @@ class FourierCode(nn.Module):
 
     def forward(self, video_idx: Tensor, time: Tensor) -> Tensor:
         """Codes (N, C) at `time` (N,) of videos `video_idx` (N,)."""
-        return torch.einsum("nk,nkc->nc", self.basis(time), self.coefficients[video_idx])
+        # Indexing with brackets adds gradients up in any order where tensors are large; this does so in theirs.
+        own = self.coefficients.index_select(0, video_idx)
+        return torch.einsum("nk,nkc->nc", self.basis(time), own)
 
 
 class MotionHead(nn.Module):
