@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -11,6 +12,8 @@ from pipeline.events import EventWriter
 from pipeline.files import read_json, relink, unique, write_atomic, write_json
 from pipeline.graph import Node
 from pipeline.workspace import Workspace
+
+_SECONDS = len("2026-09-28T10-15-00")
 
 
 class RunFolder:
@@ -65,7 +68,11 @@ def list_runs(workspace: Workspace) -> list[str]:
     """Ids of the runs, newest first."""
     if not workspace.runs.is_dir():
         return []
-    return sorted((p.name for p in workspace.runs.iterdir() if (p / "plan.json").is_file()), reverse=True)
+    found = []
+    for folder in workspace.runs.iterdir():
+        with contextlib.suppress(OSError):  # ids tell seconds only: runs of one second go by when they were planned
+            found.append((folder.name[:_SECONDS], (folder / "plan.json").stat().st_mtime_ns, folder.name))
+    return [name for _, _, name in sorted(found, reverse=True)]
 
 
 def read_plan(workspace: Workspace, run: str) -> dict[str, Any]:
