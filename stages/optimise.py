@@ -74,7 +74,7 @@ class FitSettings(PhaseSettings):
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
     """At the end, move to the root poses what all bones share, so that the trunk rests in object space."""
-    lr_root: float = 2e-4
+    lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.5
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
