@@ -62,7 +62,7 @@ class FitSettings(PhaseSettings):
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
-    motion_spacing_s: float = 0.1
+    motion_spacing_s: float = 0.0
     """Spacing of local functions of time in the pose codes, beside the waves; 0 = waves alone, as in the paper."""
     pose_code: int = 96
     """Channels of the pose codes."""
@@ -78,7 +78,7 @@ class FitSettings(PhaseSettings):
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.5
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
-    weight_cover: float = 0.02
+    weight_cover: float = 0.0
     """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag."""
     cover_from: float = 0.3
     """Share of the phase from which they do; before, limbs may not be there yet."""
