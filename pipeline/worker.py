@@ -78,6 +78,9 @@ class Worker:
     def run(self) -> int:
         """Run, write the outcome, return the exit status."""
         self._watch()
+        if self.ranks.world_size > 1:
+            node = os.environ.get("SLURMD_NODENAME") or socket.gethostname()
+            log.info("rank %d of %d on %s", self.ranks.rank, self.ranks.world_size, node)
         with FileLock(self.attempt / "alive.lock"):
             status, message, code = self._guarded()
             outcome = {
