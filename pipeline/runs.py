@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +14,27 @@ from pipeline.files import read_json, relink, unique, write_atomic, write_json
 from pipeline.graph import Node
 from pipeline.workspace import Workspace
 
+_STAMP = "%Y-%m-%dT%H-%M-%S"
 _SECONDS = len("2026-09-28T10-15-00")
 
 
 class RunFolder:
-    """The folder of one run. Holding it holds the run's lock, by which others see that it is alive."""
+    """The folder of one run. Holding it holds the run's lock, by which others see that it is alive.
+
+    Its id is the local time of its start; where an earlier run has that time or a later one (clocks are set back, in
+    autumn all of them are), the second after that run's: ids tell the order of the runs whatever the clock did.
+    """
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
-        self.id = time.strftime("%Y-%m-%dT%H-%M-%S") + "-" + unique()[-4:]
-        self.path = workspace.runs / self.id
-        self.view = self.path / "view"
-        self._lock = workspace.run_lock(self.id)
 
     def open(self) -> None:
         """Create the folder and take the lock."""
         with self.workspace.exclusive():
+            self.id = _stamp_after(self.workspace.runs) + "-" + unique()[-4:]
+            self.path = self.workspace.runs / self.id
+            self.view = self.path / "view"
+            self._lock = self.workspace.run_lock(self.id)
             self._lock.acquire()
             self.view.mkdir(parents=True)
         self.events = EventWriter(self.path / "events.jsonl")
@@ -62,6 +68,17 @@ class RunFolder:
 def view_place(view: Path, stage: str, video: str | None) -> Path:
     """Where a view shows a stage's folder."""
     return view / "videos" / video / stage if video else view / stage
+
+
+def _stamp_after(runs: Path) -> str:
+    """The time now, or the second after the newest run where that is later."""
+    now = time.strftime(_STAMP)
+    stamps = [p.name[:_SECONDS] for p in runs.iterdir()] if runs.is_dir() else []
+    newest = max((s for s in stamps if s >= now and s[:1].isdigit()), default="")
+    try:
+        return (datetime.strptime(newest, _STAMP) + timedelta(seconds=1)).strftime(_STAMP) if newest else now
+    except (ValueError, OverflowError):  # no name of ours
+        return now
 
 
 def list_runs(workspace: Workspace) -> list[str]:
