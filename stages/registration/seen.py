@@ -6,10 +6,13 @@ turn that the flow suggests and a smooth path are one hidden Markov model.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from stages.registration.answer import Answer, Subject, Tell, ViewBelief
 from stages.registration.placing import OBJECT_SIZE, smooth, view_rotation
+from stages.registration.scaling import scalings
 from stages.registration.tracking import elevation_step, forward_backward, turning_posterior
 from stages.registration.turning import expected_turns
 
@@ -35,13 +38,19 @@ TELLING = 0.2
 
 def seen(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
     """Answers for the clips that a network has looked at, in the category's own object frame (y up, z front)."""
-    del seed
-    answers = {}
+    seen_, answers = [], []
     for done, subject in enumerate(subjects):
         tell(done, len(subjects), "views by network")
         if subject.view is not None and subject.rotation is None:
-            answers[subject.name] = _answer(subject, subject.view)
-    return answers
+            seen_.append(subject)
+            answers.append(_answer(subject, subject.view))
+    if not answers:
+        return {}
+    placed = scalings(seen_, [a.rotation for a in answers], seed)
+    return {
+        s.name: replace(a, extent=p.extent, origin_px=p.origin_px)
+        for s, a, p in zip(seen_, answers, placed, strict=True)
+    }
 
 
 def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
