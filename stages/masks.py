@@ -53,8 +53,8 @@ class MaskSettings:
     """Probability above which a pixel counts as the object, for boxes, areas and flags."""
     category: str = "auto"
     """quadruped or human: a network of ours that knows it helps; other: none does; auto: whichever fits what moves."""
-    self_training_steps: int = 300
-    """Steps in which the built-in segmentation fits its small network to the clip; 0 leaves that network out."""
+    refinements: int = 2
+    """How often a network of ours goes over the built-in segmentation's rough masks; 0 leaves them rough."""
     seed: int = 0
     """Seed of the built-in segmentation."""
     network: InputFile = NO_FILE
@@ -79,7 +79,7 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        effort = Effort(network_steps=settings.self_training_steps, seed=settings.seed)
+        effort = Effort(refinements=settings.refinements, seed=settings.seed)
         images = clip.images()
         priors = _priors(images, settings.category, run)
         result = segment(images, hints, effort, tick=_ticker(run), priors=priors)
@@ -212,7 +212,7 @@ def _from_network(clip: Clip, given: Given, settings: MaskSettings, run: Run) ->
 def _prompts(clip: Clip, given: Given, settings: MaskSettings, run: Run) -> list[Prompt]:
     """Where to look in each frame: the user's hints, and the built-in segmentation that they steer."""
     hints = read_hints(given.get(".hints.toml"), clip)
-    rough = segment(clip.images(), hints, Effort(network_steps=0, seed=settings.seed), tick=_ticker(run))
+    rough = segment(clip.images(), hints, Effort(seed=settings.seed), tick=_ticker(run))
     return prompts_of(rough.probability > 127, hints)
 
 

@@ -29,20 +29,38 @@ class OwnNetwork:
     def __init__(self, category: str, *, device: str = "cpu", threads: int = 1) -> None:
         self.category = category
         self.name = f"posenet-{category}.onnx"
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = max(1, threads)
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
-        providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
-        self._session = onnxruntime.InferenceSession(_read(self.name), options, providers=providers)
+        self._session = _session(self.name, device, threads)
         self.providers: list[str] = self._session.get_providers()
         self._outputs = [o.name for o in self._session.get_outputs()]
 
     def __call__(self, inputs: np.ndarray) -> dict[str, np.ndarray]:
         """`view` (N, 60), `dense` (N, 17, 48, 48), `category` (N, 3) of (N, 4, 96, 96) float32."""
         return dict(zip(self._outputs, self._session.run(None, {"input": inputs.astype(np.float32)}), strict=True))
+
+
+class OwnRefiner:
+    """The network that makes rough masks exact (see stages.perception.refining.RefiningNetwork)."""
+
+    name = "refine.onnx"
+
+    def __init__(self, *, device: str = "cpu", threads: int = 1) -> None:
+        self._session = _session(self.name, device, threads)
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        """(N, S, S) logits of (N, 4, S, S) float32, S a multiple of 16."""
+        (logit,) = self._session.run(["logit"], {"input": inputs.astype(np.float32)})
+        return np.asarray(logit[:, 0])
+
+
+def _session(name: str, device: str, threads: int) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = max(1, threads)
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
+    providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
+    return onnxruntime.InferenceSession(_read(name), options, providers=providers)
 
 
 def canonical_surface(category: str) -> dict[str, np.ndarray]:

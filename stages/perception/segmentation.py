@@ -1,11 +1,11 @@
-"""Which pixels are the object, with no network and no download: motion, place and looks, over the whole clip.
+"""Which pixels are the object: motion, place and looks over the whole clip, and what networks of ours have learnt.
 
 1. Motion against the background gives each frame sharp but sparse evidence (`background.motion_cues`).
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
 3. The same again on plain colours, leaving the uncertain rim of the mask out of the fit: this tightens the outline.
-4. A small network is fitted to the result on crops around the object; it sees surroundings and cleans up.
-5. The outline is settled at full resolution, and flicker is voted away along the flow.
+4. A network that has learnt to mend rough masks (`refining`) does so at the pictures' own size.
+5. Flicker is voted away along the flow, and the outline is settled at full resolution.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from stages.perception.appearance import ClipNetwork, PixelColours, scaled_lab
+from stages.perception.appearance import PixelColours, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
+from stages.perception.refining import RefiningNetwork, refine
 from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
@@ -56,7 +57,7 @@ class Effort:
     """How much work the built-in segmentation does."""
 
     rounds: int = 2
-    network_steps: int = 300
+    refinements: int = 2
     seed: int = 0
 
 
@@ -95,10 +96,12 @@ def segment(
     effort: Effort | None = None,
     tick: Tick = lambda done, total, label: None,
     priors: dict[str, np.ndarray] | None = None,
+    refiner: RefiningNetwork | None = None,
 ) -> Segmentation:
     """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB.
 
     `priors` are category networks' ideas of it, (T, H, W) uint8 each; the one that fits what moves has a say.
+    `refiner` makes rough masks exact.
     """
     effort = effort or Effort()
     work = [shrink(image, WORK_SIDE_PX) for image in images]
@@ -109,12 +112,15 @@ def segment(
         told = carrier.spread(told, 0.93, strongest=False)
     chosen = choose_prior(priors or {}, cues)
     if chosen:
-        told = told + prior_evidence((priors or {})[chosen], work[0].shape[:2])
-    soft = coarse_probability(work, cues, told, carrier, effort)
+        known = told + prior_evidence((priors or {})[chosen], work[0].shape[:2])
+    else:
+        known = told
+    soft = coarse_probability(work, cues, known, carrier, effort)
     tick(1, 3, "learning")
-    soft = tight_probability(work, soft, cues, told, effort)
+    soft = tight_probability(work, soft, cues, known, effort)
     tick(2, 3, "learning")
-    soft = network_probability(work, soft, told, effort)
+    if refiner is not None:
+        soft = refined_probability(images, soft, told, refiner, effort)
     tick(3, 3, "learning")
     found = finish(images, soft, carrier)
     return Segmentation(found.probability, found.agreement, chosen)
@@ -190,24 +196,19 @@ def tight_probability(
     return found
 
 
-def network_probability(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, effort: Effort) -> np.ndarray:
-    """(T, h, w) probability from a small network fitted to crops around the object, labels near the outline soft."""
-    if effort.network_steps <= 0 or not (soft > 0.5).any():
-        return soft
-    crops = [_crop_window(p > 0.5, work[0].shape[:2]) for p in soft]
-    size = max(c[2] for c in crops), max(c[3] for c in crops)
-    windows = [_place_window(c, size, work[0].shape[:2]) for c in crops]
-    lab = np.stack([scaled_lab(work[t])[w] for t, w in enumerate(windows)])
-    target = np.stack([soft[t][w] for t, w in enumerate(windows)])
-    weight = np.clip(np.abs(target - 0.5) * 2, 0.05, 1)
-    weight[_gaps(target > 0.5) & (target < 0.5)] *= 0.3
-    network = ClipNetwork(effort.seed + 20)
-    network.fit(lab, target, weight, effort.network_steps)
-    logit = network.logit(lab)
-    out = np.zeros_like(soft)
-    for t, w in enumerate(windows):
-        out[t][w] = _sigmoid(logit[t] + 0.3 * np.log((target[t] + 0.02) / (1.02 - target[t])) + told[t][w])
-    return out
+def refined_probability(
+    images: np.ndarray, soft: np.ndarray, told: np.ndarray, refiner: RefiningNetwork, effort: Effort
+) -> np.ndarray:
+    """(T, H, W) probability at the images' own size: the rough one mended, several times over; hints still count."""
+    height, width = images.shape[1:3]
+    found = _resized(soft, width, height)
+    hinted = told.any()
+    for _ in range(effort.refinements):
+        found = refine(images, found, refiner)
+        if hinted:
+            logit = np.log((found + 0.01) / (1.01 - found))
+            found = np.stack([_sigmoid(a + cv2.resize(b, (width, height))) for a, b in zip(logit, told, strict=True)])
+    return found
 
 
 def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentation:
@@ -310,41 +311,6 @@ def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.nda
     off = np.stack([cv2.dilate(m, disc) for m in eight]) == 0
     close = np.stack([cv2.dilate(m, wide) for m in eight]) > 0
     return core.astype(np.float32), off, close
-
-
-def _gaps(masks: np.ndarray) -> np.ndarray:
-    """What closing fills in boolean (T, h, w) masks: gaps up to a tenth of their extent, where labels are doubtful."""
-    out = np.zeros_like(masks)
-    for t, mask in enumerate(masks):
-        reach = max(1, round(0.12 * np.sqrt(mask.sum())))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-        out[t] = (cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0) & ~mask
-    return out
-
-
-def _crop_window(mask: np.ndarray, shape: tuple[int, ...], margin: float = 0.2) -> tuple[int, int, int, int]:
-    """Centre column and row, width and height of a window round a mask, in multiples of 8."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if len(rows) == 0:
-        return shape[1] // 2, shape[0] // 2, 8, 8
-    width, height = columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1
-    pad = margin * max(width, height) + 4
-    return (
-        int(columns[0] + columns[-1] + 1) // 2,
-        int(rows[0] + rows[-1] + 1) // 2,
-        int(np.ceil((width + 2 * pad) / 8) * 8),
-        int(np.ceil((height + 2 * pad) / 8) * 8),
-    )
-
-
-def _place_window(
-    crop: tuple[int, int, int, int], size: tuple[int, int], shape: tuple[int, ...]
-) -> tuple[slice, slice]:
-    """Rows and columns of a window of one size for all frames, kept inside the image."""
-    width, height = min(size[0], shape[1] // 4 * 4), min(size[1], shape[0] // 4 * 4)
-    left = int(np.clip(crop[0] - width // 2, 0, shape[1] - width))
-    top = int(np.clip(crop[1] - height // 2, 0, shape[0] - height))
-    return slice(top, top + height), slice(left, left + width)
 
 
 def _sigmoid(logit: np.ndarray) -> np.ndarray:

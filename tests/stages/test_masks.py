@@ -10,14 +10,14 @@ import pytest
 from pipeline import BadInput, Folder, Given, Interrupted, Run
 from stages.formats import read_clip, read_mask_facts, read_masks
 from stages.masks import MaskSettings, _check, _sheet, masks
-from stages.perception.appearance import ClipNetwork, PixelColours
+from stages.perception.appearance import PixelColours
 from stages.perception.background import background_flow, bend_to_surroundings, motion_cues, polynomial_basis
 from stages.perception.segmentation import Effort, Hint, hint_evidence, segment
 from stages.perception.temporal import area_steadiness, describe, flow_median, main_component, mask_box, touches_border
 from tests.stages.perception_clips import moving_clip, overlap, texture, write_frames_folder
 
 IMAGES, TRUTH, _ = moving_clip(10, 96)
-QUICK = MaskSettings(self_training_steps=40)
+QUICK = MaskSettings()
 
 
 def run_masks(frames: Folder, out: Path, given: Given | None = None, settings: MaskSettings = QUICK) -> Run:
@@ -64,7 +64,7 @@ def test_a_scene_without_an_object_is_not_trusted(tmp_path: Path) -> None:
 def test_a_still_scene_with_a_box_gives_the_boxed_thing(tmp_path: Path) -> None:
     still = np.repeat(IMAGES[:1], 6, axis=0)
     box = mask_box(TRUTH[0])
-    result = segment(still, (Hint(0, box=box),), Effort(network_steps=0))
+    result = segment(still, (Hint(0, box=box),), Effort())
     assert overlap(result.probability > 127, np.repeat(TRUTH[:1], 6, axis=0)) > 0.6
 
 
@@ -154,19 +154,6 @@ def test_pixel_colours_learn_and_refuse_one_class() -> None:
     assert model.fit(values, label, np.ones(4000, np.float32), steps=150)
     assert ((model.logit(values) > 0) == (label > 0.5)).mean() > 0.95
     assert not PixelColours(3, seed=1).fit(values, np.zeros(4000), np.ones(4000))
-
-
-def test_clip_network_does_not_copy_noise() -> None:
-    rng = np.random.default_rng(0)
-    crops = rng.normal(0, 0.2, (6, 32, 32, 3)).astype(np.float32)
-    truth = np.zeros((6, 32, 32), np.float32)
-    truth[:, 8:24, 10:22] = 1
-    crops[..., 0] += truth
-    noisy = np.where(rng.random(truth.shape) < 0.2, 1 - truth, truth)
-    network = ClipNetwork(seed=0)
-    network.fit(crops, noisy, np.ones_like(noisy), steps=60, batch=4, patch_px=32)
-    found = network.logit(crops) > 0
-    assert overlap(found, truth > 0.5) > 0.85 > overlap(noisy > 0.5, truth > 0.5)
 
 
 def test_flags_boxes_and_components() -> None:
