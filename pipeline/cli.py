@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pipeline.errors import BadInput, ExitCode, PipelineError, did_you_mean
+from pipeline.errors import FULL, BadInput, ExitCode, PipelineError, did_you_mean, disk_full
 from pipeline.project import Options
 from pipeline.verbs import Verb, add_arguments, run_verb, takes_settings, verbs_of
 
@@ -22,7 +22,7 @@ _EXIT_CODES = """exit codes: 0 done · 1 an action failed · 2 usage, settings o
             4 damage found · 10 work pending (--check) · 75 stopped, resumable · 130 stopped by Ctrl-C"""
 
 # What the user can mend: no space, no permission, a read-only disk. Any other OSError is a fault of the program.
-_USERS_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS)
+_USERS_ERRNOS = (*FULL, errno.EACCES, errno.EPERM, errno.EROFS)
 
 _SETTINGS_HELP = "any setting of a stage: --STAGE.KEY VALUE (see `banmo settings`)"
 
@@ -264,6 +264,7 @@ def main(argv: list[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    args = argparse.Namespace(workspace="the disk")
     try:
         rest, overrides = split_overrides(words)
         verb = next((w for w in rest if not w.startswith("-")), "")
@@ -295,7 +296,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if error.errno not in _USERS_ERRNOS:
             raise
-        sys.stderr.write(f"banmo: {BadInput(str(error.strerror), where=error.filename or 'the disk')}\n")
+        told = disk_full(error.filename or args.workspace) if error.errno in FULL else None
+        sys.stderr.write(f"banmo: {told or BadInput(str(error.strerror), where=error.filename or 'the disk')}\n")
         return ExitCode.USAGE
 
 

@@ -106,7 +106,7 @@ class PlainDisplay:
                 self._told[label] = now
                 self._line(f"{label}: {progress_text(event)}")
         elif kind == "done":
-            self._line(f"{label}: done in {duration(event['seconds'])}")
+            self._line(f"{label}: done in {duration(event.get('seconds', 0.0))}")
         elif kind == "failed":
             self._line(f"{label}: failed: {text}")
         elif kind == "bad_input":
@@ -131,8 +131,8 @@ def progress_text(event: dict[str, Any]) -> str:
     total = event.get("total")
     done = event.get("done", 0)
     text = f"{done:g}/{total:g}" if isinstance(total, int | float) and total > 0 else f"{done:g}"
-    if event.get("label"):
-        text = f"{event['label']} {text}"
+    if event.get("what"):
+        text = f"{event['what']} {text}"
     extra = event.get("extra") or {}
     words = [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in extra.items()]
     return "  ".join([text, *words])

@@ -7,6 +7,7 @@ Anything else that reaches the top is a fault of the program and shows its trace
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 from enum import IntEnum
 
@@ -79,6 +80,19 @@ class StageError(PipelineError):
 
 class Interrupted(Exception):
     """A stage stopped because it was asked to; what it checkpointed is kept."""
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Numbers of the system's errors by which it says that nothing more can be written."""
+
+
+FULL_STATUS = 28
+"""Exit status of a worker that could not even write how it ended."""
+
+
+def disk_full(root: object) -> BadInput:
+    """What to say to people when the disk of the workspace `root` is full."""
+    return BadInput("the disk is full", where=root, hint="free some space and run again")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

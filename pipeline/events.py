@@ -8,6 +8,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from pipeline.errors import printable
+
+_OF_WORKERS = ("started", "waiting", "progress", "warning")
+
 
 class EventWriter:
     """Appends events to a file, one line each, in one write. Losing an event never stops the work."""
@@ -54,3 +58,28 @@ class EventReader:
             if isinstance(value, dict):
                 found.append(value)
         return found
+
+
+def of_worker(event: dict[str, Any]) -> dict[str, Any]:
+    """An event as a worker may send it: the kinds it may tell of, numbers that are numbers, text fit for a terminal.
+
+    Whatever else a stage wrote into its events becomes the kind "unknown", a sign of life and no more.
+    """
+    kind = event.get("event")
+    if kind not in _OF_WORKERS:
+        return {"event": "unknown"}
+    found: dict[str, Any] = {"event": kind}
+    for name in ("done", "total", "pid"):
+        if _is_number(event.get(name)):
+            found[name] = event[name]
+    for name in ("text", "what"):
+        if isinstance(event.get(name), str):
+            found[name] = printable(event[name])
+    extra = event.get("extra")
+    if isinstance(extra, dict):
+        found["extra"] = {printable(str(k)): v if _is_number(v) else printable(str(v)) for k, v in extra.items()}
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300

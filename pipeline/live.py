@@ -91,12 +91,12 @@ class LiveDisplay:
             self._running[label] = Progress(time.monotonic())
         elif kind == "progress" and label in self._running:
             progress = self._running[label]
-            another = [event.get(k) for k in ("label", "total")] != [progress.event.get(k) for k in ("label", "total")]
+            another = [event.get(k) for k in ("what", "total")] != [progress.event.get(k) for k in ("what", "total")]
             progress.event = event
             if progress.first is None or another or event.get("done", 0) < progress.first[1]:
                 progress.first = (time.monotonic(), float(event.get("done", 0)))
         elif kind in ("waiting", "silent") and label in self._running:
-            self._running[label].event = {"label": event.get("text", ""), "done": 0}
+            self._running[label].event = {"what": event.get("text", ""), "done": 0}
         elif kind in ("done", "failed", "bad_input", "interrupted"):
             self._running.pop(label, None)
         if kind == "done":

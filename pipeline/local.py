@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from pipeline.definition import StageInfo, child_environment
-from pipeline.errors import ExitCode
+from pipeline.errors import FULL_STATUS, ExitCode, disk_full
 from pipeline.executor import Grant, Job, Launch, Outcome, Watched, event_reader, fault_of_a_rank, read_outcome
 
 _LAST_RANKS_S = 20.0
@@ -144,6 +144,8 @@ class LocalJob:
     def _without_outcome(self, codes: list[int]) -> Outcome:
         if self._stop_by is not None or codes[0] in (ExitCode.INTERRUPTED, -signal.SIGTERM):
             return Outcome("interrupted", "killed: it did not stop in time" if self._killed else "stopped")
+        if FULL_STATUS in codes:
+            return Outcome("bad_input", str(disk_full(self._attempt.parent.parent)))
         fault = fault_of_a_rank(self._attempt)
         if fault:
             return Outcome("failed", fault)

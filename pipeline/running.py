@@ -96,7 +96,7 @@ class Run:
         self._last_tick = now
         event: dict[str, Any] = {"event": "progress", "done": done, "total": total}
         if label:
-            event["label"] = label
+            event["what"] = label
         if extra:
             event["extra"] = {k: _plain(v) for k, v in extra.items()}
         self._sink(event)

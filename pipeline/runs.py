@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.events import EventWriter
-from pipeline.files import read_json, relink, unique, write_atomic, write_json
+from pipeline.files import read_json, relink, remove_tree, unique, write_atomic, write_json
 from pipeline.graph import Node
 from pipeline.workspace import Workspace
 
@@ -44,6 +44,11 @@ class RunFolder:
         self.events.close()
         self._lock.release()
         (self.workspace.leases / f"run-{self.id}.lock").unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Let go of the lock, and leave no trace: nothing was run."""
+        self.close()
+        remove_tree(self.path)
 
     def log_path(self, node: Node) -> Path:
         """Log of one action of this run."""

@@ -12,8 +12,9 @@ from types import FrameType
 from typing import Any
 
 from pipeline.errors import BadInput
+from pipeline.events import of_worker
 from pipeline.executor import Executor, Grant, Job, Launch, Outcome, silent_after
-from pipeline.files import remove_tree, write_json
+from pipeline.files import remove_tree, write_json, write_memo
 from pipeline.graph import Node
 from pipeline.guard import needs_decision
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
@@ -24,6 +25,7 @@ from pipeline.waiting import Waiting
 
 _POLL_S = 0.05
 _SILENT_S = 600.0
+_KILLED_S = 5.0
 
 
 class Scheduler:
@@ -75,7 +77,7 @@ class Scheduler:
         finally:
             if not self.executor.survives:
                 for job in self._jobs.values():
-                    job.kill()
+                    _end(job)
             for number, handler in previous.items():
                 signal.signal(number, handler)
         self.report.not_started = [n.label for n in (*chain(*self._ready.values()), *self._waiting)]
@@ -229,9 +231,9 @@ class Scheduler:
     def _collect(self) -> None:
         for node, job in list(self._jobs.items()):
             outcome = job.poll()
-            for event in job.events.read():
+            for event in map(of_worker, job.events.read()):
                 job.watched.last_sign = time.monotonic()
-                self._tell(node, {k: v for k, v in event.items() if k != "label"})
+                self._tell(node, event)
             if outcome is None:
                 self._mind_silence(node, job)
                 continue
@@ -265,7 +267,7 @@ class Scheduler:
             spent = seconds + job.watched.spent_s if outcome.status == "interrupted" else 0.0
             if outcome.status == "interrupted" and not self._stopping():
                 outcome = Outcome("failed", outcome.message + " although nobody asked")
-            write_json(
+            write_memo(
                 note,
                 {
                     "status": outcome.status,
@@ -325,3 +327,12 @@ class Scheduler:
     def _ask_all_to_stop(self) -> None:
         for job in self._jobs.values():
             job.ask_to_stop(self._grace_s)
+
+
+def _end(job: Job) -> None:
+    """Kill what still runs when the run breaks off, wait for its end, and clear its scratch away."""
+    job.kill()
+    deadline = time.monotonic() + _KILLED_S
+    while job.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    remove_tree(job.watched.attempt)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -123,12 +123,18 @@ def find_garbage(workspace: Workspace, keep_runs: int, wanted: Iterable[str] = (
     return found
 
 
-def collect(workspace: Workspace, garbage: Garbage) -> None:
-    """Delete it: records first, then what they named. Refuses while anybody works."""
+def collect(workspace: Workspace, find: Callable[[], Garbage]) -> Garbage:
+    """Delete what `find` finds once nobody else can start a run, and return it: records first, then what they named.
+
+    Refuses while anybody works. What was found before is not trusted: a run may have ended since that stands on it.
+    """
     with workspace.exclusive():
         live = workspace.live()
         if live:
             raise BadInput("a run is at work in this workspace", where=workspace.root, hint="wait until it has ended")
+        workspace.collected()
+        workspace.ledger.refresh()
+        garbage = find()
         for stage, key in garbage.records:
             workspace.ledger.path(stage, key).unlink(missing_ok=True)
         workspace.ledger.refresh()
@@ -141,6 +147,7 @@ def collect(workspace: Workspace, garbage: Garbage) -> None:
         for path in workspace.leases.glob("*.lock"):
             if path.name != "workspace.lock":
                 path.unlink(missing_ok=True)
+    return garbage
 
 
 def pins(workspace: Workspace) -> dict[str, str]:

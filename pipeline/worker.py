@@ -7,7 +7,7 @@ stop; what it checkpointed stays. Exit status: 0 done, 1 failed, 2 the input is 
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import logging
 import os
 import signal
@@ -24,7 +24,17 @@ from filelock import FileLock, Timeout
 
 from pipeline.contract import Folder, Given, Source, Stage
 from pipeline.describe import bind, build, load_stage, settings_class
-from pipeline.errors import BadInput, ExitCode, Interrupted, PipelineError, StageError, printable
+from pipeline.errors import (
+    FULL,
+    FULL_STATUS,
+    BadInput,
+    ExitCode,
+    Interrupted,
+    PipelineError,
+    StageError,
+    disk_full,
+    printable,
+)
 from pipeline.events import EventWriter
 from pipeline.files import failpoint, read_json, remove_tree, write_json
 from pipeline.ledger import Record
@@ -49,7 +59,13 @@ def main(argv: list[str]) -> int:
     )
     ranks = Ranks.from_environment()
     attempt = request_path.parent
-    return Worker(request, attempt, ranks).run()
+    try:
+        return Worker(request, attempt, ranks).run()
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        _print_traceback()
+        return FULL_STATUS
 
 
 class Worker:
@@ -89,6 +105,8 @@ class Worker:
                 "record": self.record.key if self.record else None,
                 "warnings": self.context.warnings,
             }
+            if code != ExitCode.DONE:
+                remove_tree(self.attempt / "out")  # where the disk is full, this makes room to say so
             if self.attempt.is_dir():  # whoever waited for rank 0 may have cleared it away
                 write_json(self.attempt / "outcome.json", outcome)
         return code
@@ -110,10 +128,8 @@ class Worker:
             log.error("%s", error)
             return "failed", str(error), ExitCode.FAILED
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                text = str(
-                    BadInput("the disk is full", where=self.workspace.root, hint="free some space and run again")
-                )
+            if error.errno in FULL:
+                text = str(disk_full(error.filename or self.workspace.root))
                 log.error("%s", text)
                 return "bad_input", text, ExitCode.USAGE
             return self._failure(error)
@@ -123,7 +139,7 @@ class Worker:
             return self._failure(error)
 
     def _failure(self, error: BaseException) -> tuple[str, str, int]:
-        traceback.print_exc(file=sys.stderr)
+        _print_traceback()
         last = traceback.format_exception_only(type(error), error)[-1].strip()
         return "failed", printable(last), ExitCode.FAILED
 
@@ -275,6 +291,12 @@ class Worker:
         time.sleep(float(self.request["grace_s"]))
         log.error("the parent is gone and the stage does not stop; leaving")
         os._exit(ExitCode.INTERRUPTED)
+
+
+def _print_traceback() -> None:
+    """Into the log, which may lie on a full disk itself."""
+    with contextlib.suppress(OSError):
+        traceback.print_exc(file=sys.stderr)
 
 
 def _stamp(moment: datetime) -> str:

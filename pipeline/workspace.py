@@ -27,7 +27,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from pipeline.errors import BadInput
-from pipeline.files import read_json, remove_tree, write_atomic, write_memo
+from pipeline.files import read_json, remove_tree, unique, write_atomic, write_memo
 from pipeline.ledger import Ledger
 from pipeline.objects import Objects
 
@@ -144,6 +144,17 @@ class Workspace:
             return True
         lock.release()
         return False
+
+    def collection(self) -> str:
+        """Changes whenever ``gc`` or a repair takes something away: what was planned before may miss it."""
+        try:
+            return (self.cache / "collected").read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            return ""
+
+    def collected(self) -> None:
+        """Something is about to be taken away, under the exclusive lock."""
+        write_atomic(self.cache / "collected", unique())
 
     def _lock(self, path: Path) -> FileLock:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -44,6 +44,7 @@ def verify_command(args: argparse.Namespace, options: Options) -> int:
         with workspace.exclusive():
             if workspace.live():
                 raise BadInput("a run is at work in this workspace", hint="wait until it has ended")
+            workspace.collected()
             found = verify(workspace, deep=args.deep or bool(args.sample), share=share, repair=True)
     else:
         found = verify(workspace, deep=args.deep or bool(args.sample), share=share)
@@ -83,9 +84,10 @@ def gc_command(args: argparse.Namespace, options: Options) -> int:
     except BadInput as error:  # videos moved away, say: the kept runs still protect their results
         sys.stderr.write(f"note: the present plan is unknown ({error})\n")
     keep = ExecutionSection().keep_runs if keep is None else keep
+    runs_kept = keep
     garbage = find_garbage(workspace, keep, wanted)
     if args.apply and garbage:
-        collect(workspace, garbage)
+        garbage = collect(workspace, lambda: find_garbage(workspace, runs_kept, wanted))
     if args.json:
         folders = [str(p.relative_to(workspace.root)) for p in garbage.folders]
         print_json(

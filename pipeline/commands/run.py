@@ -48,7 +48,16 @@ def run_command(args: argparse.Namespace, options: Options) -> int:
 def run(options: Options, selection: Selection, flags: Flags) -> int:
     """Make everything that is not up to date; returns the exit status."""
     clock = time.monotonic()
+    while True:
+        code = _attempt(options, selection, flags, clock)
+        if code is not None:
+            return code
+
+
+def _attempt(options: Options, selection: Selection, flags: Flags, clock: float) -> int | None:
+    """Plan and execute; None when ``gc`` took something away between the two, so that the plan may be wrong."""
     project = Project.open(options, create=True)
+    collection = project.workspace.collection()
     nodes, forced = project.select(selection)
     planner = project.planner(forced)
     steps = planner.plan(nodes)
@@ -66,7 +75,12 @@ def run(options: Options, selection: Selection, flags: Flags) -> int:
     if not pending:
         return _nothing_to_do(project, planner, steps, selection, clock)
     check_disk(project, planner, pending)
-    return _execute(project, planner, steps, selection, flags, clock)
+    folder = RunFolder(project.workspace)
+    folder.open()  # from here on nothing is collected
+    if project.workspace.collection() != collection:
+        folder.discard()
+        return None
+    return _execute(project, planner, steps, selection, flags, clock, folder)
 
 
 def _say_plan(steps: list[Step], pending: list[Step], flags: Flags) -> None:
@@ -94,17 +108,16 @@ def _nothing_to_do(project: Project, planner: Planner, steps: list[Step], select
 
 
 def _execute(
-    project: Project, planner: Planner, steps: list[Step], selection: Selection, flags: Flags, clock: float
-) -> int:
+    project: Project, planner: Planner, steps: list[Step], selection: Selection, flags: Flags, clock: float,
+    folder: RunFolder,
+) -> int:  # fmt: skip
     out = sys.stdout
     pending = [s for s in steps if s.status != HIT]
-    out.write(f"{len(pending)} of {len(steps)} to run:\n")
-    print_plan(steps)
-    out.flush()
-    project.workspace.clean_scratch()
-    folder = RunFolder(project.workspace)
-    folder.open()
     try:
+        out.write(f"{len(pending)} of {len(steps)} to run:\n")
+        print_plan(steps)
+        out.flush()
+        project.workspace.clean_scratch()
         folder.write_plan(plan_json(steps), to_toml(project.settings))
         folder.make_latest()
         executor, cpus = _executor(project, folder, pending)

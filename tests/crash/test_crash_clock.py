@@ -1,4 +1,4 @@
-"""Clocks that jump: set back, set forward, and files whose times make no sense. Time may mislead people, never the store."""
+"""Clocks that jump, and files whose times make no sense. Time may mislead people, never the store."""
 
 from __future__ import annotations
 

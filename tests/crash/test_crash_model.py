@@ -147,8 +147,7 @@ class StoreModel(RuleBasedStateMachine):
         keys = sorted(self.records)
         wanted = set(keys[: len(keys) // 2])
         with mock.patch("time.time", return_value=_now() + _OLD):
-            garbage = find_garbage(self.workspace, 0, wanted)
-            collect(self.workspace, garbage)
+            collect(self.workspace, lambda: find_garbage(self.workspace, 0, wanted))
         self.workspace.ledger.refresh()
         for key in set(keys) - wanted:
             del self.records[key]

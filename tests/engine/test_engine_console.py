@@ -99,7 +99,7 @@ def test_figures_for_people() -> None:
         "3000.0 TB",
     ]
     assert progress_text({"done": 3}) == "3"
-    assert progress_text({"done": 3, "total": 0, "label": "looking"}) == "looking 3"
+    assert progress_text({"done": 3, "total": 0, "what": "looking"}) == "looking 3"
 
 
 def test_time_left_starts_anew_with_another_part_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,12 +107,12 @@ def test_time_left_starts_anew_with_another_part_of_the_work(monkeypatch: pytest
     monkeypatch.setattr(time, "monotonic", lambda: now)
     display = live.LiveDisplay(steps(), {}, cpus=2, console=Console(file=io.StringIO()))
     display.event("merge", {"event": "launched"})
-    display.event("merge", {"event": "progress", "done": 0, "total": 10, "label": "slow"})
+    display.event("merge", {"event": "progress", "done": 0, "total": 10, "what": "slow"})
     now += 100.0
-    display.event("merge", {"event": "progress", "done": 10, "total": 10, "label": "slow"})
-    display.event("merge", {"event": "progress", "done": 10, "total": 20, "label": "fast"})
+    display.event("merge", {"event": "progress", "done": 10, "total": 10, "what": "slow"})
+    display.event("merge", {"event": "progress", "done": 10, "total": 20, "what": "fast"})
     now += 2.0
-    display.event("merge", {"event": "progress", "done": 12, "total": 20, "label": "fast"})
+    display.event("merge", {"event": "progress", "done": 12, "total": 20, "what": "fast"})
     assert display._running["merge"].seconds_left() == pytest.approx(8.0)
-    display.event("merge", {"event": "progress", "done": 5, "total": 0, "label": "looking"})
+    display.event("merge", {"event": "progress", "done": 5, "total": 0, "what": "looking"})
     assert display._running["merge"].seconds_left() is None
