@@ -7,7 +7,6 @@ them an empty JSON element with the id ``provenance`` is filled with what no res
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 import tomllib
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput
-from pipeline.files import read_json, remove_tree, unique, write_json
+from pipeline.files import read_json, replacing, write_json
 from pipeline.ledger import Record
 from pipeline.objects import walk
 from pipeline.plan import Planner
@@ -43,10 +42,8 @@ def export(project: Project, planner: Planner, to: Path | None = None) -> Path |
 def _export(project: Project, planner: Planner, records: dict[str, Record], target: Path) -> None:
     if _is_there(target, records):
         return
-    wanted, before = _wanted(records), _before(target)
-    fresh = target.with_name(f".{target.name}-{unique()}")
-    try:
-        fresh.mkdir(parents=True)
+    with replacing(target) as fresh:
+        wanted, before = _wanted(records), _before(target)
         for record in records.values():
             if not project.workspace.objects.sound(record.stage, record.digest):
                 raise BadInput(f"the result of {record.label} is damaged", hint="run again")
@@ -57,13 +54,6 @@ def _export(project: Project, planner: Planner, records: dict[str, Record], targ
         files = {name: [s.st_size, s.st_mtime_ns] for name, _, s in walk(fresh)}
         write_json(fresh / PROVENANCE, {**provenance, "files": files})
         _keep_foreign(target, fresh, before["files"])
-        retired = target.with_name(f".{target.name}-retired-{unique()}")
-        if target.exists():
-            os.rename(target, retired)
-        os.rename(fresh, target)
-        remove_tree(retired)
-    finally:
-        remove_tree(fresh)
 
 
 def _wanted(records: dict[str, Record]) -> dict[str, str]:

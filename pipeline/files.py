@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -13,10 +14,12 @@ import shutil
 import signal
 import stat
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 CHUNK = 1 << 20
+_RETIRED = "-retired-"
 
 
 def failpoint(name: str) -> None:
@@ -141,3 +144,32 @@ def relink(link: Path, target: str) -> None:
     except OSError:
         temporary.unlink(missing_ok=True)
         write_atomic(link.with_name(link.name + ".path"), target + "\n")
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A fresh empty folder beside `target` that takes its place when the block ends without an error.
+
+    A crash between the two renames leaves the old folder beside its place; the next call puts it back first.
+    """
+    _put_back(target)
+    fresh = target.with_name(f".{target.name}-{unique()}")
+    try:
+        fresh.mkdir(parents=True)
+        yield fresh
+        retired = target.with_name(f".{target.name}{_RETIRED}{unique()}")
+        if target.exists():
+            os.rename(target, retired)
+        failpoint("between_renames")
+        os.rename(fresh, target)
+        remove_tree(retired)
+    finally:
+        remove_tree(fresh)
+
+
+def _put_back(target: Path) -> None:
+    if target.parent.is_dir() and not os.path.lexists(target):
+        retired = sorted(target.parent.glob(f".{glob.escape(target.name)}{_RETIRED}*"))
+        if retired:
+            with contextlib.suppress(OSError):  # another process has just done it
+                os.rename(retired[-1], target)

@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.action import Action, action
 from pipeline.graph import Graph, Node
 from pipeline.ledger import Record
+from pipeline.locks import Patience
 from pipeline.reasons import Reason, compare, nearest
 from pipeline.remote import Remote
 from pipeline.settings import Settings, stage_values
@@ -51,6 +52,7 @@ class Planner:
         self.steps: dict[str, Step] = {}
         self._texts: dict[str, dict[str, Any]] = {}
         self._salt = settings.pipeline.salt
+        self.patience = Patience(settings.store.latency_s)
 
     def plan(self, nodes: list[Node]) -> list[Step]:
         """Decide every node as far as it can be decided now."""
@@ -66,11 +68,12 @@ class Planner:
             wanted = self.action(node)
             record = self.workspace.ledger.find(node.info.name, wanted.key)
             if self._elsewhere is not None and node not in self.forced and not self._serves(node, record):
-                record = fetch(self.workspace, self._elsewhere, node.info.name, wanted.key) or record
+                found = fetch(self.workspace, self._elsewhere, node.info.name, wanted.key, self.patience)
+                record = found or record
             if record is None:
                 record, reasons = self._reasons(node, wanted)
                 step = Step(node, RUN, wanted, record, reasons)
-            elif not self.workspace.objects.sound(node.info.name, record.digest):
+            elif not self._serves(node, record):
                 step = Step(node, RUN, wanted, record, [Reason("damaged", f"objects/{node.info.name}/{record.digest}")])
             elif node in self.forced:
                 step = Step(node, RUN, wanted, record, [Reason("asked for")])
@@ -81,7 +84,15 @@ class Planner:
         return step
 
     def _serves(self, node: Node, record: Record | None) -> bool:
-        return record is not None and self.workspace.objects.sound(node.info.name, record.digest)
+        """Whether the folder of a record is whole; a network disk may show it later than the record."""
+        if record is None:
+            return False
+        objects, kind = self.workspace.objects, node.info.name
+        if objects.sound(kind, record.digest):
+            return True
+        if not self.workspace.is_far or not objects.quick_check(kind, record.digest, record.files, record.bytes):
+            return False
+        return self.patience.until(lambda: objects.sound(kind, record.digest))
 
     @cached_property
     def _elsewhere(self) -> Remote | None:

@@ -55,6 +55,8 @@ class Project:
             overrides = [(str(n), str(t)) for n, t in memory.get("overrides", [])]
             preset, skip = memory.get("preset"), [str(s) for s in memory.get("skip_videos", [])]
         settings = resolve(definition, workspace.settings_path, overrides, preset)
+        if create:
+            workspace.use_locks(settings.store.locks, settings.store.expire_s)
         folder = _videos_dir(options, settings, memory, workspace)
         videos = discover(folder, definition.given_suffixes)
         left_out = {find_video(videos, word).name for word in (*skip, *settings.pipeline.skip_videos)}

@@ -75,6 +75,14 @@ class Remote:
         """Whether the seal of a folder is there: it is written after the folder."""
         return self.read(f"objects/{kind}/{digest}.sha256") is not None
 
+    def complete(self, kind: str, digest: str) -> bool:
+        """Whether everything that the seal of a folder names is there, whatever its content."""
+        seal = self.read(f"objects/{kind}/{digest}.sha256")
+        entries = parse_manifest(seal.decode("utf-8", "replace")) if seal else None
+        return bool(entries) and all(
+            safe(name) and self._fs.exists(self._path(f"objects/{kind}/{digest}/{name}")) for name in entries or ()
+        )
+
     def fetch(self, kind: str, digest: str, scratch: Path) -> bool:
         """Copy a folder into the empty folder `scratch`, every byte hashed; False when it is not whole there."""
         seal = self.read(f"objects/{kind}/{digest}.sha256")

@@ -39,6 +39,7 @@ def build_request(planner: Planner, step: Step, run: str, grant: Grant) -> dict[
         "device": "cuda" if grant.gpus else "cpu",
         "threads": grant.threads,
         "grace_s": planner.settings.execution.grace_s,
+        "latency_s": planner.settings.store.latency_s,
         "watch_parent": True,
     }
 

@@ -7,7 +7,6 @@ videos have since moved away.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from typing import Any
 from pipeline.contract import Folder
 from pipeline.definition import read_toml
 from pipeline.errors import BadInput, did_you_mean
-from pipeline.files import remove_tree, unique, write_atomic
+from pipeline.files import replacing, write_atomic
 from pipeline.ledger import Record
 from pipeline.project import Options, Project
 from pipeline.reasons import words_of
@@ -133,19 +132,9 @@ class Results:
         What an earlier call put there is replaced; a folder that the user made is refused. An absolute `name` is
         taken as it is.
         """
-        target = self._target(Path(name))
-        fresh = target.with_name(f".{target.name}-{unique()}")
-        try:
-            fresh.mkdir(parents=True)
+        with replacing(self._target(Path(name))) as fresh:
             yield fresh
             write_atomic(fresh / _MARK, "This folder is made anew by the command that made it; keep nothing here.\n")
-            retired = target.with_name(f".{target.name}-retired-{unique()}")
-            if target.exists():
-                os.rename(target, retired)
-            os.rename(fresh, target)
-            remove_tree(retired)
-        finally:
-            remove_tree(fresh)
 
     # ------------------------------------------------------------------ inside
 

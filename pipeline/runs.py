@@ -43,7 +43,7 @@ class RunFolder:
         """Let go of the lock."""
         self.events.close()
         self._lock.release()
-        (self.workspace.leases / f"run-{self.id}.lock").unlink(missing_ok=True)
+        Path(self._lock.lock_file).unlink(missing_ok=True)
 
     def discard(self) -> None:
         """Let go of the lock, and leave no trace: nothing was run."""

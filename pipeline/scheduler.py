@@ -17,6 +17,7 @@ from pipeline.executor import Executor, Grant, Job, Launch, Outcome, silent_afte
 from pipeline.files import remove_tree, write_json, write_memo
 from pipeline.graph import Node
 from pipeline.guard import needs_decision
+from pipeline.ledger import Record
 from pipeline.plan import HIT, RUN, WAIT, Planner, Step
 from pipeline.request import build_request
 from pipeline.runs import RunFolder
@@ -253,7 +254,7 @@ class Scheduler:
         seconds = round(time.monotonic() - job.watched.started, 2)
         note = self.workspace.attempts / f"{self._key(node)}.json"
         if outcome.status == "done":
-            record = self.workspace.ledger.find(node.info.name, self._key(node))
+            record = self._record_of(node)
             if record is None:
                 outcome = Outcome("failed", "it said it was done but left no record")
             else:
@@ -289,6 +290,13 @@ class Scheduler:
                 self._ask_all_to_stop()
         log = os.path.relpath(job.watched.log_path, self.workspace.root)
         self._tell(node, {"event": outcome.status, "text": outcome.message, "seconds": seconds, "log": log})
+
+    def _record_of(self, node: Node) -> Record | None:
+        """The record that a worker has written; from another machine it may show up late."""
+        stage, key = node.info.name, self._key(node)
+        if self.workspace.is_far:
+            self.planner.patience.until(lambda: self.workspace.ledger.find(stage, key) is not None)
+        return self.workspace.ledger.find(stage, key)
 
     def _key(self, node: Node) -> str:
         step = self._steps[node.label]

@@ -73,6 +73,12 @@ class StoreSection:
 
     shared: str = ""
     """A store to read through to: a folder or URL that `banmo push` has filled; what is found there is copied here."""
+    locks: Literal["auto", "kernel", "expiring"] = "auto"
+    """Locks of the workspace: the kernel's, or leases that expire, for network disks; auto looks at the file system."""
+    expire_s: float = 60.0
+    """Time without a sign of life after which an expiring lease may be taken over."""
+    latency_s: float = 30.0
+    """How long a network disk or a shared store may hide files that are written already; waited once in a command."""
 
 
 _OWN: dict[str, type] = {"pipeline": PipelineSection, "execution": ExecutionSection, "store": StoreSection}

@@ -61,7 +61,7 @@ def live_events(workspace: Workspace) -> dict[str, dict[str, Any]]:
     if not workspace.runs.is_dir():
         return found
     for run in sorted(workspace.runs.iterdir()):
-        if not workspace.held(workspace.leases / f"run-{run.name}.lock"):
+        if not workspace.runs_now(run.name):
             continue
         for event in EventReader(run / "events.jsonl").read():
             label, kind = str(event.get("label", "")), event.get("event")

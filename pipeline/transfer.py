@@ -15,6 +15,7 @@ from typing import Any
 from pipeline.errors import BadInput
 from pipeline.files import relink, remove_tree, unique, write_atomic
 from pipeline.ledger import Record, parse
+from pipeline.locks import Patience
 from pipeline.remote import Remote
 from pipeline.runs import list_runs, read_plan, view_place
 from pipeline.workspace import Workspace
@@ -111,12 +112,20 @@ def pull(workspace: Workspace, remote: Remote, *, everything: bool = False, dry_
     return moved
 
 
-def fetch(workspace: Workspace, remote: Remote, stage: str, key: str) -> Record | None:
-    """The record of an action from another store, its folder brought here and verified; None when it has none."""
+def fetch(workspace: Workspace, remote: Remote, stage: str, key: str, patience: Patience) -> Record | None:
+    """The record of an action from another store, its folder brought here and verified; None when it has none.
+
+    A record is written after its folder: what of that is missing may be on its way still, and is waited for.
+    """
     data = remote.read(f"actions/{stage}/{key}.json")
     record = parse(_json(data), stage, key)
-    if record is None or not _bring(workspace, remote, record):
+    if record is None:
         return None
+    if not _bring(workspace, remote, record):
+        late = not remote.complete(stage, record.digest)
+        arrived = late and patience.until(lambda: remote.complete(stage, record.digest))
+        if not (arrived and _bring(workspace, remote, record)):
+            return None
     workspace.ledger.write(record)
     return record
 

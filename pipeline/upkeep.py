@@ -144,8 +144,8 @@ def collect(workspace: Workspace, find: Callable[[], Garbage]) -> Garbage:
                 workspace.objects.remove(kind, digest)
         for path in garbage.folders:
             remove_tree(path)
-        for path in workspace.leases.glob("*.lock"):
-            if path.name != "workspace.lock":
+        for path in workspace.leases.glob(f"*{workspace.locks.suffix}"):
+            if path.stem != "workspace":
                 path.unlink(missing_ok=True)
     return garbage
 

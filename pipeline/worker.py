@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from pipeline.contract import Folder, Given, Source, Stage
 from pipeline.describe import bind, build, load_stage, settings_class
@@ -38,6 +38,7 @@ from pipeline.errors import (
 from pipeline.events import EventWriter
 from pipeline.files import failpoint, read_json, remove_tree, write_json
 from pipeline.ledger import Record
+from pipeline.locks import Patience
 from pipeline.ranks import Ranks
 from pipeline.running import Run
 from pipeline.source import CodeReader
@@ -97,7 +98,7 @@ class Worker:
         if self.ranks.world_size > 1:
             node = os.environ.get("SLURMD_NODENAME") or socket.gethostname()
             log.info("rank %d of %d on %s", self.ranks.rank, self.ranks.world_size, node)
-        with FileLock(self.attempt / "alive.lock"):
+        with self.workspace.locks.at(self.attempt / "alive"):
             status, message, code = self._guarded()
             outcome = {
                 "status": status,
@@ -230,8 +231,12 @@ class Worker:
     def _arguments(self, found: Stage, out: Path) -> dict[str, Any]:
         request = self.request
 
+        patience = Patience(float(request["latency_s"]) if self.workspace.is_far else 0.0)
+
         def folder(value: dict[str, str]) -> Folder:
-            return Folder(Path(value["path"]), value["digest"])
+            path = Path(value["path"])
+            patience.until(path.is_dir)  # another machine may have made it just now
+            return Folder(path, value["digest"])
 
         known: dict[str, Any] = {"out": out, "run": self.context}
         for name, value in request["inputs"].items():

@@ -19,16 +19,19 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, Timeout
 
 from pipeline.errors import BadInput
 from pipeline.files import read_json, remove_tree, unique, write_atomic, write_memo
 from pipeline.ledger import Ledger
+from pipeline.locks import EXPIRING, Locks
 from pipeline.objects import Objects
 
 FORMAT = "1"
@@ -105,45 +108,57 @@ class Workspace:
 
     # ------------------------------------------------------------------ locks
 
-    def lease(self, key: str) -> FileLock:
-        """Held by the worker of an action. The kernel drops it when its holder dies."""
-        return self._lock(self.leases / f"{key}.lock")
+    @cached_property
+    def locks(self) -> Locks:
+        """The kind of locks that this disk asks for."""
+        return Locks.of(self.leases, self.root)
 
-    def run_lock(self, run: str) -> FileLock:
+    @property
+    def is_far(self) -> bool:
+        """Whether other machines may write here, so that files may show up late."""
+        return self.locks.kind == EXPIRING
+
+    def use_locks(self, kind: str, expire_s: float) -> None:
+        """Write the choice of the user down, for all commands; ``auto`` leaves it to the file system."""
+        path = self.leases / "kind"
+        text = "" if kind == "auto" else f"{kind} {expire_s:g}\n"
+        if text and (not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text):
+            write_atomic(path, text)
+        elif not text:
+            path.unlink(missing_ok=True)
+        self.__dict__.pop("locks", None)
+
+    def lease(self, key: str) -> BaseFileLock:
+        """Held by the worker of an action, until its end or death."""
+        return self.locks.at(self.leases / key)
+
+    def run_lock(self, run: str) -> BaseFileLock:
         """Held by a run while it is alive."""
-        return self._lock(self.leases / f"run-{run}.lock")
+        return self.locks.at(self.leases / f"run-{run}")
 
     @contextmanager
     def exclusive(self, timeout_s: float = 60.0) -> Iterator[None]:
         """Nobody else starts a run, collects or repairs meanwhile."""
         try:
-            with self._lock(self.leases / "workspace.lock").acquire(timeout=timeout_s):
-                yield
+            held = self.locks.at(self.leases / "workspace").acquire(timeout=max(timeout_s, 2 * self.locks.expire_s))
         except Timeout as error:
-            raise BadInput(
-                f"another command has kept this workspace busy for {timeout_s:.0f} s", where=self.root
-            ) from error
+            raise BadInput("another command keeps this workspace busy", where=self.root) from error
+        with held:
+            yield
 
     def live(self) -> list[str]:
         """Names of the leases and runs that somebody holds now."""
-        held = []
-        for path in sorted(self.leases.glob("*.lock")) if self.leases.is_dir() else []:
-            if path.name != "workspace.lock" and self.held(path):
-                held.append(path.stem)
-        return held
+        deadline = time.monotonic() + 1.5 * self.locks.expire_s if self.locks.kind == EXPIRING else 0.0
+        names = [p.name.removesuffix(self.locks.suffix) for p in self.leases.glob(f"*{self.locks.suffix}")]
+        return [
+            name
+            for name in sorted(names)
+            if name != "workspace" and self.locks.held(self.leases / name, max(0.0, deadline - time.monotonic()))
+        ]
 
-    @staticmethod
-    def held(path: Path) -> bool:
-        """Whether a living process holds this lock."""
-        if not path.exists():
-            return False
-        lock = FileLock(path)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            return True
-        lock.release()
-        return False
+    def runs_now(self, run: str) -> bool:
+        """Whether this run is alive."""
+        return self.locks.held(self.leases / f"run-{run}")
 
     def collection(self) -> str:
         """Changes whenever ``gc`` or a repair takes something away: what was planned before may miss it."""
@@ -156,10 +171,6 @@ class Workspace:
         """Something is about to be taken away, under the exclusive lock."""
         write_atomic(self.cache / "collected", unique())
 
-    def _lock(self, path: Path) -> FileLock:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return FileLock(path)
-
     # ------------------------------------------------------------------ scratch
 
     def clean_scratch(self) -> None:
@@ -171,7 +182,7 @@ class Workspace:
             run = re.match(r"try-(.+)-[0-9a-f]{8}$", attempt.name)
             if run is None or attempt.name in queued:
                 continue
-            if self.held(attempt / "alive.lock") or self.held(self.leases / f"run-{run[1]}.lock"):
+            if self.locks.held(attempt / "alive") or self.runs_now(run[1]):
                 continue
             remove_tree(attempt)
 

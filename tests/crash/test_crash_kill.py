@@ -134,6 +134,18 @@ def test_a_read_only_store_still_serves(lab: Lab) -> None:
     assert outcome.code == 0, outcome.err
 
 
+def test_a_power_cut_while_exports_are_swapped_loses_no_file_of_the_user(lab: Lab) -> None:
+    assert lab.run().code == 0
+    own = lab.workspace / "exports" / "my notes.txt"
+    own.write_text("mine")
+    child = lab.spawn("--merge.steps", "5", env={"BANMO_FAILPOINT": "between_renames"})
+    child.communicate()
+    assert child.returncode == -signal.SIGKILL and not own.exists(), "it died between the two renames"
+    assert lab.run("--merge.steps", "5").code == 0
+    assert own.read_text() == "mine" and (lab.workspace / "exports/parts/steps.txt").read_text() == "5"
+    assert not list(lab.workspace.glob(".exports-retired-*"))
+
+
 def test_memos_torn_by_a_crash_do_no_harm(lab: Lab) -> None:
     lab.run()
     for path in (lab.workspace / "cache").rglob("*.json"):
