@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import json
 import os
 import random
@@ -26,13 +27,17 @@ import numpy as np
 import pytest
 
 from pipeline.cli import split_overrides
+from pipeline.console import PlainDisplay, progress_text
 from pipeline.definition import Definition, StageInfo
 from pipeline.errors import BadInput
-from pipeline.events import EventReader
+from pipeline.events import EventReader, of_worker
+from pipeline.executor import read_outcome
 from pipeline.ledger import Ledger
+from pipeline.locks import Locks
 from pipeline.objects import Objects, digest_of, parse_manifest
 from pipeline.remote import safe
 from pipeline.settings import resolve
+from pipeline.slurm import read_note
 from pipeline.slurm_queue import parse_squeue
 from tests.fuzz.mutations import mutate
 
@@ -157,6 +162,12 @@ def matrices(count: int) -> list[Any]:
 POSES = json.dumps({"K": [[50, 0, 16], [0, 50, 12], [0, 0, 1]], "object_to_camera": matrices(3)}).encode()
 
 
+OTHER_INTRINSICS = [
+    json.dumps({"intrinsics": way, "object_to_camera": matrices(3)}).encode()
+    for way in ({"fx": 50, "fy": 49.5, "cx": 16, "cy": 12}, [50, 50, 16, 12], [[50, 0, 16], [0, 50, 12], [0, 0, 1]])
+]
+
+
 @pytest.fixture(scope="module")
 def place() -> Iterator[Path]:
     """A folder in memory where there is one: the inputs are many and small."""
@@ -180,8 +191,6 @@ def clip(root: Path) -> Any:
 
 
 def png() -> bytes:
-    import io
-
     from PIL import Image
 
     stream = io.BytesIO()
@@ -266,8 +275,50 @@ def read_manifest(path: Path) -> Any:
     return entries
 
 
+def read_events(path: Path) -> Any:
+    """Whatever a worker writes into its events, displays show one plain line of it."""
+    found = [of_worker(event) for event in EventReader(path).read()]
+    screen = io.StringIO()
+    display = PlainDisplay(screen, interval_s=0.0)
+    for event in found:
+        display.event("words/cat", event)
+        progress_text(event)
+    assert all(c.isprintable() or c == "\n" for c in screen.getvalue())
+    return found
+
+
+def read_outcome_file(path: Path) -> Any:
+    (path.parent / "outcome.json").write_bytes(path.read_bytes())
+    found = read_outcome(path.parent)
+    assert found is None or found.status in ("done", "failed", "bad_input", "interrupted")
+    return found
+
+
+def read_job(path: Path) -> Any:
+    """The number of a job goes to Slurm's commands, its attempt becomes a path."""
+    note = read_note(path)
+    assert note is None or ("/" not in note["attempt"] and note["job"].replace("_", "").isdigit())
+    return note
+
+
+def read_locks(path: Path) -> Any:
+    folder = path.parent / "leases"
+    folder.mkdir(exist_ok=True)
+    (folder / "kind").write_bytes(path.read_bytes())
+    found = Locks.of(folder, path.parent)
+    assert found.kind in ("kernel", "expiring") and 0 < found.expire_s <= 3600
+    return found
+
+
 MANIFEST = b"".join(b"%064x  inner/%d.txt\n" % (i, i) for i in range(3))
 EVENTS = b'{"event": "progress", "done": 3, "total": 9}\n{"event": "done", "label": "a"}\n'
+OF_WORKERS = (
+    b'{"event": "started", "pid": 7}\n{"event": "progress", "done": 1.5, "total": null, "what": "x",'
+    b' "extra": {"loss": 0.3, "n": 4, "s": "t"}}\n{"event": "warning", "text": "w"}\n'
+    b'{"event": "waiting", "text": "q"}\n'
+)
+OUTCOME = b'{"status": "done", "message": "", "record": "%064x", "warnings": ["a", "b"]}' % 7
+JOB = b'{"job": "13_4", "attempt": "try-2026-01-01T00-00-00-abcd-01234567", "log": "/w/runs/r/logs/x.txt"}'
 SQUEUE = b"12|RUNNING|None\n13_4|PENDING|Resources\n13_[5-9]|PENDING|Priority\n"
 WORDS = b"run\n--s.count\n4\n--set\ns.share=0.2\n--s.many=1,2\n--s.pair\n[3, 'z']\nclips\n--s.on\n--\n--s.x\n"
 
@@ -283,12 +334,18 @@ def reader_of(name: str, root: Path) -> Reader:
     if name == "manifests":
         return Reader(read_manifest, [MANIFEST], ())
     if name == "events":
-        return Reader(lambda p: EventReader(p).read(), [EVENTS], ())
+        return Reader(read_events, [EVENTS, OF_WORKERS], ())
+    if name == "outcomes":
+        return Reader(read_outcome_file, [OUTCOME], ())
+    if name == "jobs":
+        return Reader(read_job, [JOB], (), ".json")
+    if name == "locks":
+        return Reader(read_locks, [b"expiring 60\n", b"kernel 0.5\n"], ())
     if name == "queue":
         return Reader(lambda p: parse_squeue(p.read_bytes().decode("utf-8", "replace")), [SQUEUE], ())
     if name == "given poses":
         read = named("stages.poses", "read_given")
-        return Reader(lambda p: read(p, clip(p.parent)), [POSES], (BadInput,), ".json")
+        return Reader(lambda p: read(p, clip(p.parent)), [POSES, *OTHER_INTRINSICS], (BadInput,), ".json")
     if name == "stored poses":
         formats = importlib.import_module("stages.formats")
         return Reader(formats.read_poses, [POSES], (formats.FormatError,), ".json")
@@ -319,8 +376,8 @@ def reader_of(name: str, root: Path) -> Reader:
 
 
 NAMES = (
-    "settings", "command line", "records", "manifests", "events", "queue", "given poses", "stored poses", "hints",
-    "masks", "glb", "bvh", "camera paths", "weights.toml", "contracts", "onnx",
+    "settings", "command line", "records", "manifests", "events", "outcomes", "jobs", "locks", "queue", "given poses",
+    "stored poses", "hints", "masks", "glb", "bvh", "camera paths", "weights.toml", "contracts", "onnx",
 )  # fmt: skip
 
 
