@@ -31,7 +31,7 @@ from training.wardrobe import Bank, Random
 
 log = logging.getLogger(__name__)
 KEEP_SHARE = 0.995
-LOG_EVERY = 20
+LOG_EVERY, KEEP_EVERY = 10, 50
 
 
 class Refiner(nn.Module):
@@ -137,6 +137,8 @@ def train(
                 record.write(json.dumps(line) + "\n")
                 record.flush()
                 running = []
+            if (step + 1) % KEEP_EVERY == 0:
+                _keep(kept, network, averaged, optimiser, step + 1)
     _keep(kept, network, averaged, optimiser, first + steps)
     return averaged
 

@@ -26,6 +26,7 @@ from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
+MOTION_SIDE_PX = 192  # motion tells no more at 256, at five times the work
 CARRY_SIDE_PX = 128
 LEAST_PRIOR_AREA = 2e-3
 LEAST_PRIOR_SCORE = 0.35
@@ -105,7 +106,7 @@ def segment(
     """
     effort = effort or Effort()
     work = [shrink(image, WORK_SIDE_PX) for image in images]
-    cues = motion_cues(work, tick=lambda done: tick(done, len(work), "motion"))
+    cues = _motion(work, tick)
     carrier = Carrier(work)
     told = hint_evidence(hints, images.shape[1:3], work[0].shape[:2], len(work))
     if hints:
@@ -229,6 +230,13 @@ def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentati
 
 
 # --------------------------------------------------------------------------------------------- pieces
+
+
+def _motion(work: list[np.ndarray], tick: Tick) -> MotionCues:
+    """Motion cues at the working size, found at a smaller one."""
+    height, width = work[0].shape[:2]
+    found = motion_cues([shrink(image, MOTION_SIDE_PX) for image in work], tick=lambda n: tick(n, len(work), "motion"))
+    return MotionCues(_resized(found.moving, width, height), _resized(found.evidence, width, height))
 
 
 def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[int, ...], count: int) -> np.ndarray:

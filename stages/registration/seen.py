@@ -16,17 +16,19 @@ from stages.registration.scaling import scalings
 from stages.registration.tracking import elevation_step, forward_backward, turning_posterior
 from stages.registration.turning import expected_turns
 
-FRAME_WEIGHT = 0.15
+FRAME_WEIGHT = 0.12
 """What one frame counts: neighbours look alike, so a mistake lasts for a second rather than for a frame."""
 DOUBT = 0.1
 """How likely a frame's opinion is to be worth nothing."""
-TURN_SHARE = 0.7
-TURN_SIGMA = 0.06
+TURN_SHARE = 0.9
+TURN_SIGMA = 0.1
 """A turn from frame to frame is this share of what the flow suggests, give or take the latter, radians."""
 LEAST_MATCHED = 0.1
 """Mean confidence of the flow on the object below which it says nothing of a turn."""
-ELEVATION_ERROR = np.radians(10.0)
-USUAL_ELEVATION, USUAL_SPREAD = np.radians(18.0), np.radians(10.0)
+TILT_ERROR = np.radians(10.0)
+USUAL_ELEVATION, USUAL_ELEVATION_SPREAD = np.radians(18.0), np.radians(10.0)
+USUAL_ROLL_SPREAD = np.radians(5.0)
+"""People hold a camera level and a little above what stands on the ground, mostly."""
 TILT_SIGMA = np.radians(1.0)
 """Change of elevation and roll from frame to frame, radians."""
 AGREEMENT = np.pi / 4
@@ -64,21 +66,22 @@ def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarra
     sigma = np.where(matched[:-1] > LEAST_MATCHED, TURN_SIGMA, np.pi)
     posterior, bins = turning_posterior(azimuth, view.azimuth_bins, turn, sigma)
     mean = posterior @ np.exp(1j * bins)
-    raised = with_habit(view.elevation, view.elevation_bins)
-    tilt = [_steady(say * p, b) for p, b in ((raised, view.elevation_bins), (view.roll, view.roll_bins))]
+    raised = with_habit(view.elevation, view.elevation_bins, USUAL_ELEVATION, USUAL_ELEVATION_SPREAD)
+    turned = with_habit(view.roll, view.roll_bins, 0.0, USUAL_ROLL_SPREAD)
+    tilt = [_steady(say * p, b) for p, b in ((raised, view.elevation_bins), (turned, view.roll_bins))]
     return smooth(np.unwrap(np.angle(mean)), 2.0), smooth(tilt[0], 2.0), smooth(tilt[1], 2.0), np.abs(mean)
 
 
-def with_habit(elevation: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """Log-probability (T, E) of elevations after the network's own uncertainty and how people film are added to it.
+def with_habit(tilt: np.ndarray, bins: np.ndarray, usual: float, spread: float) -> np.ndarray:
+    """Log-probability (T, B) of tilts after the network's own uncertainty and how people film are added to it.
 
     The network's error is alike in a whole clip, so however sure of each frame it is, its opinion is widened by
-    ELEVATION_ERROR first. People hold a camera a little above what stands on the ground, mostly.
+    TILT_ERROR first. Four clips in five are filmed at the `usual` tilt, give or take `spread` (radians).
     """
-    away = np.exp(-0.5 * ((bins[:, None] - bins[None]) / ELEVATION_ERROR) ** 2)
-    habit = np.exp(-0.5 * ((bins - USUAL_ELEVATION) / USUAL_SPREAD) ** 2)
+    away = np.exp(-0.5 * ((bins[:, None] - bins[None]) / TILT_ERROR) ** 2)
+    habit = np.exp(-0.5 * ((bins - usual) / spread) ** 2)
     habit = 0.8 * habit / habit.sum() + 0.2 / len(bins)
-    wide = np.exp(elevation) @ (away / away.sum(axis=0)).T * habit
+    wide = np.exp(tilt) @ (away / away.sum(axis=0)).T * habit
     return np.asarray(np.log(wide / wide.sum(axis=1, keepdims=True)))
 
 

@@ -98,9 +98,14 @@ def test_bearings_are_read_between_bins_and_round_the_circle() -> None:
     assert read.max(axis=1) == pytest.approx([0.0, 0.0])
 
 
-def test_an_unsure_elevation_leans_to_the_usual_and_a_steep_one_stays_steep() -> None:
+def test_an_unsure_tilt_leans_to_the_usual_and_a_strong_one_stays_strong() -> None:
     bins = np.radians(np.arange(-25.0, 90.0, 10.0))
     said = _log(bins, np.radians(np.array([5.0, 75.0])), 4.0, periodic=False)
-    low, steep = np.degrees((np.exp(with_habit(said, bins)) * bins).sum(axis=1))
+    low, steep = np.degrees((np.exp(with_habit(said, bins, np.radians(18.0), np.radians(10.0))) * bins).sum(axis=1))
     assert 8 < low < 15
     assert steep > 60
+    level = np.radians(np.arange(-41.25, 45.0, 7.5))
+    said = _log(level, np.radians(np.array([6.0, 35.0])), 4.0, periodic=False)
+    slight, lying = np.degrees((np.exp(with_habit(said, level, 0.0, np.radians(5.0))) * level).sum(axis=1))
+    assert 0 < slight < 4
+    assert lying > 20
