@@ -7,19 +7,22 @@ object space is the frame in which the bulk of the surface (a trunk, not limbs) 
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from stages.geometry.rotations import rigid
+from stages.geometry.rotations import invert_rigid, matrix_to_quaternion, quaternion_to_matrix, rigid
 from stages.model.banmo import Banmo
 
 
 @torch.no_grad()
-def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25) -> float:
+def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25, steady_s: float = 0.2) -> float:
     """Set ``model.gauge`` so that the surface moves least in object space; given root poses stay as they are.
 
-    `softness` (units) is the distance from which a point counts as moving limb. Returns the mean turn made (radians)
-    over the frames whose root poses are free.
+    `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
+    `steady_s` (seconds, a Gaussian's width) stays with the bones: a hand-held camera and a body's heading are slower.
+    Returns the mean turn made (radians) over the frames whose root poses are free.
     """
     points = model.surface
     if len(points) < 10:
@@ -36,6 +39,14 @@ def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 
     if not free.any():
         return 0.0
     motion = rigid_parts(posed, free, softness, rounds)
+    index = torch.arange(len(model.time), device=points.device)
+    whole = torch.cat([model.frames(some).camera_from_object.cpu() for some in index.split(64)])
+    settled = whole @ invert_rigid(motion)
+    for i, video in enumerate(model.videos):
+        mine = slice(model.starts[i], model.starts[i + 1])
+        if free[mine].all():
+            settled[mine] = steadied(settled[mine], np.asarray(video.time_s), steady_s)
+    motion = torch.where(free[:, None, None], invert_rigid(settled) @ whole, motion)
     model.gauge.copy_(motion.to(model.gauge) @ model.gauge)
     trace = motion[free, :3, :3].diagonal(dim1=1, dim2=2).sum(-1)
     return float(((trace - 1) / 2).clamp(-1, 1).acos().mean())
@@ -62,6 +73,28 @@ def rigid_parts(posed: Tensor, free: Tensor, softness: float, rounds: int) -> Te
         better = free & (_cost(posed, shape, found, softness) < _cost(posed, shape, motion, softness))
         motion[better] = found[better]
     return motion
+
+
+def steadied(poses: Tensor, time_s: np.ndarray, width_s: float) -> Tensor:
+    """Rigid motions (T, 4, 4) smoothed over `width_s` (a Gaussian's), as quaternions and shifts; even turns stay."""
+    spacing = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    sigma = width_s / max(spacing, 1e-6)
+    if len(poses) < 3 or sigma < 0.1:
+        return poses
+    turns = matrix_to_quaternion(poses[:, :3, :3].double())
+    turns = turns * torch.cumprod(torch.cat([turns.new_ones(1), _sign((turns[1:] * turns[:-1]).sum(-1))]), 0)[:, None]
+    track = torch.cat([turns, poses[:, :3, 3].double()], 1).numpy()
+    pad = min(len(track) - 1, int(4 * sigma) + 1)
+    # Mirrored through its ends, a steady course goes on beyond them.
+    before, after = 2 * track[:1] - track[pad:0:-1], 2 * track[-1:] - track[-2 : -pad - 2 : -1]
+    smooth = gaussian_filter1d(np.concatenate([before, track, after]), sigma, axis=0, mode="nearest")
+    smooth = torch.from_numpy(smooth[pad : pad + len(track)])
+    quaternion = torch.nn.functional.normalize(smooth[:, :4], dim=1)
+    return rigid(quaternion_to_matrix(quaternion), smooth[:, 4:]).to(poses.dtype)
+
+
+def _sign(value: Tensor) -> Tensor:
+    return torch.where(value < 0, -1.0, 1.0).to(value.dtype)
 
 
 def _moved(points: Tensor, motion: Tensor) -> Tensor:

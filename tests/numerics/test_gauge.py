@@ -1,10 +1,11 @@
 """The rigid motion that root poses and bones share is found, moved over, and changes no picture."""
 
+import numpy as np
 import pytest
 import torch
 
-from stages.fitting.gauge import align, rigid_parts, settle
-from stages.geometry.rotations import rigid, so3_exp
+from stages.fitting.gauge import align, rigid_parts, settle, steadied
+from stages.geometry.rotations import geodesic_angle, rigid, so3_exp
 from stages.model.banmo import Architecture, Banmo, VideoFacts
 from stages.model.skeleton import Bones
 
@@ -80,3 +81,16 @@ def test_a_model_keeps_its_gauge_on_disk(model: Banmo) -> None:
     again = Banmo.restore(dict(model.state_dict()), model.describe())
     time = torch.tensor([0.3])
     assert torch.equal(again.root_poses(0, time), model.root_poses(0, time))
+
+
+def test_steadying_keeps_an_even_turn_and_takes_out_what_is_quick() -> None:
+    time = np.arange(60) / 20
+    angle = torch.linspace(0.5, 6.0, 60)  # through half a turn, where quaternions change sign
+    even = rigid(so3_exp(torch.stack([torch.zeros(60), angle, torch.zeros(60)], 1)), torch.ones(60, 3))
+    assert torch.allclose(steadied(even, time, 0.2), even, atol=0.02)
+    shaken = even @ _rigid(60, 0.1, 5)
+    found = steadied(shaken, time, 0.2)
+    assert float(torch.linalg.det(found[:, :3, :3]).sub(1).abs().max()) < 1e-4
+    before, after = geodesic_angle(shaken[:, :3, :3], even[:, :3, :3]), geodesic_angle(found[:, :3, :3], even[:, :3, :3])
+    assert float(after.mean()) < 0.5 * float(before.mean())
+    assert torch.equal(steadied(even[:2], time[:2], 0.2), even[:2])
