@@ -87,6 +87,7 @@ soak: $(STAMP)  ## kill writers 500 times and whole runs 20 times; compare with 
 	BANMO_SOAK_KILLS=500 BANMO_SOAK_MINUTES=$(MINUTES) $(PYTHON) -m pytest tests/crash/test_crash_soak.py -s $(ARGS)
 	BANMO_MODEL_EXAMPLES=400 $(PYTHON) -m pytest tests/crash/test_crash_model.py $(ARGS)
 	BANMO_RUN_KILLS=20 $(PYTHON) -m pytest tests/crash/test_crash_kill.py $(ARGS)
+	BANMO_FULL_DISKS=32 BANMO_FAULT_RUNS=16 BANMO_GC_ROUNDS=12 $(PYTHON) -m pytest tests/crash/test_crash_faults.py $(ARGS)
 	BANMO_SOAK=20 $(PYTHON) -m pytest tests/end_to_end/test_kill.py -s $(ARGS)
 
 fuzz: $(STAMP)  ## 100,000 damaged inputs for each reader of foreign files (MINUTES bounds it)

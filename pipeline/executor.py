@@ -87,8 +87,13 @@ class Watched:
 class Job(Protocol):
     """A running attempt."""
 
-    watched: Watched
-    events: Events
+    @property
+    def watched(self) -> Watched:
+        """What the scheduler remembers of it."""
+
+    @property
+    def events(self) -> Events:
+        """Where its events are read."""
 
     def poll(self) -> Outcome | None:
         """How it ended; None while it runs or waits."""
