@@ -91,6 +91,6 @@ def test_steadying_keeps_an_even_turn_and_takes_out_what_is_quick() -> None:
     shaken = even @ _rigid(60, 0.1, 5)
     found = steadied(shaken, time, 0.2)
     assert float(torch.linalg.det(found[:, :3, :3]).sub(1).abs().max()) < 1e-4
-    before, after = geodesic_angle(shaken[:, :3, :3], even[:, :3, :3]), geodesic_angle(found[:, :3, :3], even[:, :3, :3])
+    before, after = (geodesic_angle(track[:, :3, :3], even[:, :3, :3]) for track in (shaken, found))
     assert float(after.mean()) < 0.5 * float(before.mean())
     assert torch.equal(steadied(even[:2], time[:2], 0.2), even[:2])
