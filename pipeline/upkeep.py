@@ -98,6 +98,8 @@ def find_garbage(workspace: Workspace, keep_runs: int, wanted: Iterable[str] = (
     latest = _latest_run(workspace)
     kept |= {latest} if latest else set()
     roots = {row.get("key") for run in kept for row in read_plan(workspace, run).get("steps", [])} | set(wanted)
+    roots |= {p.stem for p in workspace.jobs.glob("*.json")}  # of jobs that wait or run on a cluster, for days maybe
+    spared = roots | workspace.attempts_of_jobs()
     now = time.time()
     found = Garbage()
     live: set[tuple[str, str]] = set()
@@ -117,7 +119,7 @@ def find_garbage(workspace: Workspace, keep_runs: int, wanted: Iterable[str] = (
             found.folders.append(workspace.runs / run)
     for place in (workspace.checkpoints, workspace.tmp):
         for path in sorted(place.iterdir()) if place.is_dir() else []:
-            if path.name not in roots and _age(path, now) > _YOUNG_S:
+            if path.name not in spared and _age(path, now) > _YOUNG_S:
                 found.folders.append(path)
     found.bytes += sum(tree_bytes(p) for p in found.folders)
     return found

@@ -124,7 +124,7 @@ class Workspace:
         text = "" if kind == "auto" else f"{kind} {expire_s:g}\n"
         if text and (not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text):
             write_atomic(path, text)
-        elif not text:
+        elif not text and path.is_file():
             path.unlink(missing_ok=True)
         self.__dict__.pop("locks", None)
 

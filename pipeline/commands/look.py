@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from pipeline.commands.show import ago, nodes_named, open_quietly, print_json
 from pipeline.console import duration, size
 from pipeline.definition import child_environment
 from pipeline.errors import BadInput, ExitCode
+from pipeline.files import unique
 from pipeline.graph import Node
 from pipeline.ledger import Record
 from pipeline.objects import walk
@@ -122,14 +124,19 @@ def _sheet(project: Project, node: Node, record: Record, path: Path) -> Path | N
     picture = project.workspace.cache / "sheets" / f"{record.stage}-{record.digest[:16]}.png"
     if picture.is_file():
         return picture
-    picture.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        picture.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        sys.stderr.write(f"note: no contact sheet: {error.strerror}\n")
+        return None
+    drawing = picture.with_name(f".{unique()}.png")  # one that was cut short must not be shown ever after
     folders = _input_folders(project, node, record)
     if folders is None:
         return None
     request = {
         "reference": node.info.reference,
         "out": str(path),
-        "picture": str(picture),
+        "picture": str(drawing),
         "inputs": folders,
         "settings": stage_values(project.settings, node.info),
     }
@@ -141,7 +148,10 @@ def _sheet(project: Project, node: Node, record: Record, path: Path) -> Path | N
         capture_output=True,
         text=True,
     )
-    if child.returncode != 0:
+    if child.returncode == 0 and drawing.is_file():
+        os.replace(drawing, picture)
+    elif child.returncode != 0:
+        drawing.unlink(missing_ok=True)
         sys.stderr.write(f"note: no contact sheet: {(child.stderr.strip().splitlines() or ['it failed'])[-1]}\n")
     return picture if picture.is_file() else None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -208,7 +209,60 @@ def test_gc_refuses_while_a_worker_outlives_its_run(lab: Lab) -> None:
     assert clean_store.code == 0, clean_store.out
 
 
-# ---------------------------------------------------------------------- a disk that is full
+def test_gc_spares_what_a_job_in_the_queue_will_need(lab: Lab) -> None:
+    """A cluster may let a job wait for days, and nobody holds anything meanwhile."""
+    lab.run(*ONE)
+    key = "a" * 64
+    attempt = lab.workspace / "tmp" / "try-2026-01-01T00-00-00-abcd-01234567"
+    unfinished = lab.workspace / "checkpoints" / key
+    for folder in (attempt, unfinished):
+        folder.mkdir(parents=True)
+        (folder / "x").write_text("x")
+    note = lab.workspace / "jobs" / f"{key}.json"
+    note.parent.mkdir()
+    note.write_text(json.dumps({"job": "7", "attempt": attempt.name, "log": "x"}))
+    age(lab)
+    assert lab.command("gc", "--apply").code == 0
+    assert attempt.exists() and unfinished.exists()
+    note.unlink()
+    assert lab.command("gc", "--apply").code == 0
+    assert not attempt.exists() and not unfinished.exists()
+
+
+# ---------------------------------------------------------------------- disks that are read-only or full
+
+
+def mounted(*words: str) -> None:
+    """Run ``mount``; skips the test where that is not permitted."""
+    try:
+        done = subprocess.run(["mount", *words], capture_output=True, text=True)
+    except FileNotFoundError:
+        pytest.skip("there is no mount here")
+    if done.returncode:
+        pytest.skip(f"mounting is not permitted here ({done.stderr.strip()})")
+
+
+@pytest.fixture
+def read_only(lab: Lab) -> Iterator[Lab]:
+    """A finished workspace on a disk that can only be read, by the superuser too."""
+    assert lab.run().code == 0
+    place = str(lab.workspace)
+    mounted("--bind", place, place)
+    try:
+        mounted("-o", "remount,ro,bind", place)
+        yield lab
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_a_read_only_disk_still_serves(read_only: Lab) -> None:
+    outcome = read_only.run()
+    assert outcome.code == 0 and "everything is up to date: 8 results" in outcome.out, outcome.err
+    for words in (("status",), ("why", "final"), ("verify", "--deep"), ("inspect", "upper", "cat"), ("gc",)):
+        outcome = read_only.command(*words)
+        assert outcome.code == 0, (words, outcome.err)
+    outcome = read_only.run("--upper.mark", "?")
+    assert outcome.code == 2 and outcome.err.count("\n") == 1 and "Read-only" in outcome.err, outcome.err
 
 
 @pytest.fixture
@@ -216,13 +270,7 @@ def small_disk(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The workspace on a file system of its own that holds two megabytes, which nobody is told beforehand."""
     monkeypatch.setattr("pipeline.commands.run.check_disk", lambda *_: None)
     lab.workspace.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=2m", "banmo-test", str(lab.workspace)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True)
-    except FileNotFoundError:
-        pytest.skip("there is no mount here")
-    if done.returncode:
-        pytest.skip(f"mounting is not permitted here ({done.stderr.strip()})")
+    mounted("-t", "tmpfs", "-o", "size=2m", "banmo-test", str(lab.workspace))
     yield lab.workspace
     subprocess.run(["umount", "-l", str(lab.workspace)], check=True)
 
