@@ -1,8 +1,7 @@
 """flow: where each pixel goes, forward and backward, at several distances in time.
 
 Who answers, first to last: `clip.flow/` beside the video (the same layout: `fw-01/00000.png` ... in KITTI's format, or
-`.npy`), the ONNX network that the settings name, DIS (OpenCV) on the whole frames, long steps started from chained
-short ones.
+`.npy`), the ONNX network that the settings name, DIS (OpenCV) on the whole frames, long steps chained from short ones.
 """
 
 from __future__ import annotations
@@ -47,8 +46,8 @@ class FlowSettings:
 
     steps: tuple[int, ...] = FLOW_STEPS
     """Distances in kept frames between which flow is computed."""
-    quality: str = "medium"
-    """Preset of DIS: ultrafast, fast, medium or fine; the smallest step always gets "fine" with medium."""
+    quality: str = "fine"
+    """Preset of DIS: ultrafast, fast, medium or fine. Neighbours are matched; longer steps are chained."""
     network: InputFile = NO_FILE
     """An ONNX file of two pictures in, flow out (the OpenCV zoo's RAFT as it is); empty for none."""
     network_contract: InputFile = NO_FILE
@@ -108,9 +107,7 @@ def _provider(
         images = clip.images()
         return network.name, direct_pairs(images, steps, network)
     grey = np.stack([cv2.cvtColor(clip.image(i), cv2.COLOR_RGB2GRAY) for i in range(len(clip))])
-    matcher = Matcher(settings.quality)
-    chain = Chain(grey, matcher, Matcher("fine") if settings.quality == "medium" else matcher)
-    return f"dis-{settings.quality}", chain.pairs(steps)
+    return f"dis-{settings.quality}", Chain(grey, Matcher(settings.quality)).pairs(steps)
 
 
 def _write_pair(pair: FlowPair, clip: Clip, out: Path, figures: dict[int, list[tuple[float, float]]]) -> None:

@@ -89,13 +89,28 @@ def test_chains_reach_farther_than_direct_matching() -> None:
     rng = np.random.default_rng(1)
     wide = cv2.cvtColor(texture(rng, 96, 500, (0, 0, 0), (255, 255, 255)), cv2.COLOR_RGB2GRAY)
     grey = np.stack([wide[:, 9 * t : 9 * t + 128] for t in range(9)])
-    chain = Chain(grey, Matcher(), Matcher("fine"))
-    pairs = [p for p in chain.pairs((1, 2, 4, 8)) if p.step == 8]
+    every = list(Chain(grey, Matcher("fine")).pairs((1, 2, 4, 8)))
+    assert [(p.step, p.first_idx) for p in every] == [(s, i) for s in (1, 2, 4, 8) for i in range(9 - s)]
+    pairs = [p for p in every if p.step == 8]
     stays = pixel_grid(96, 128)[..., 0] > 80  # what is still in sight 72 px further left
     error = np.linalg.norm(pairs[0].forward - np.float32([-72, 0]), axis=-1)[stays]
     direct = Matcher()(grey[0], grey[8])
     assert np.median(error) < 1.0
     assert np.median(error) < np.median(np.linalg.norm(direct - np.float32([-72, 0]), axis=-1)[stays])
+
+
+def test_chains_of_odd_lengths_are_the_sum_of_their_links() -> None:
+    frames = np.zeros((8, 24, 32), np.uint8)
+    steps = iter(range(1, 100))
+
+    class Counting(Matcher):
+        def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+            return np.full((24, 32, 2), next(steps), np.float32)
+
+    # links of two frames: there 1, 3, 5 ... and back 2, 4, 6 ...
+    pairs = {(p.step, p.first_idx): p for p in Chain(frames, Counting()).pairs((2, 6))}
+    assert set(pairs) == {(2, i) for i in range(6)} | {(6, i) for i in range(2)}
+    assert pairs[6, 0].forward[5, 5, 0] == 1 + 5 + 9 and pairs[6, 1].backward[5, 5, 0] == 4 + 8 + 12
 
 
 def test_enlarged_flow_keeps_its_meaning() -> None:
