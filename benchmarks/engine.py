@@ -1,6 +1,6 @@
 """What the engine itself costs, without any vision: ``python -m benchmarks.engine [--videos 1000] [--actions 100000]``.
 
-Prints, from one run: the no-op run of a finished workspace (time and memory of a process of its own), the plan of many
+Prints, from one run (seconds on the clock, and of the processor where neighbours may slow the clock): the no-op run of a finished workspace (time and memory of a process of its own), the plan of many
 actions of which none has run, and publishing a folder of many files against copying and hashing the same files.
 The pipeline is the toy of the engine's tests: three results a video of three small files each, two for all.
 """
@@ -75,24 +75,25 @@ def measure_no_op(root: Path, videos: int, repeats: int) -> dict[str, Any]:
         results = fill(options)
     command = [sys.executable, "-m", "pipeline.cli", "run", "--workspace", str(options.workspace)]
     command += ["--definition", str(root / "toy"), str(options.videos)]
-    told, seconds = "", []
-    for _ in range(repeats + 1):  # the first hashes what it has not seen and fills the memos
-        clock = time.monotonic()
-        told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        seconds.append(time.monotonic() - clock)
-    if "everything is up to date" not in told:
-        raise RuntimeError(told[-500:])
     measured = (
-        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+        "import resource, subprocess, sys, time; clock = time.monotonic();"
+        "told = subprocess.run(sys.argv[1:], check=True, capture_output=True, text=True).stdout;"
+        "assert 'everything is up to date' in told, told[-500:];"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
+        "print(time.monotonic() - clock, used.ru_utime + used.ru_stime, used.ru_maxrss / 1000)"
     )
-    peak = subprocess.run([sys.executable, "-c", measured, *command], capture_output=True, text=True, check=True).stdout
+    rows = []
+    for _ in range(repeats + 1):  # the first hashes what it has not seen and fills the memos
+        child = subprocess.run([sys.executable, "-c", measured, *command], capture_output=True, text=True, check=True)
+        rows.append([float(word) for word in child.stdout.split()])
+    seconds, cpu, peak = zip(*rows, strict=True)
     return {
         "videos": videos,
         "results": results,
         "seconds": min(seconds[1:]),
+        "cpu_seconds": min(cpu[1:]),
         "first_seconds": seconds[0],
-        "peak_mb": int(peak.split()[-1]) / 1000,
+        "peak_mb": max(peak),
     }
 
 
@@ -100,17 +101,18 @@ def measure_plan(root: Path, actions: int) -> dict[str, Any]:
     """Seconds and memory to plan so many actions of which none has run, in this process."""
     options = _options(root / "plan", root / "toy", (actions - 2 + 2) // 3)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    clock = time.monotonic()
+    clock, used = time.monotonic(), time.process_time()
     project = Project.open(options, create=True)
     planner = project.planner()
     steps = planner.plan(project.graph.nodes)
-    seconds = time.monotonic() - clock
+    seconds, cpu = time.monotonic() - clock, time.process_time() - used
     clock = time.monotonic()
     project.planner().plan(project.graph.nodes)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     return {
         "actions": len(steps),
         "seconds": seconds,
+        "cpu_seconds": cpu,
         "again_seconds": time.monotonic() - clock,
         "bytes_an_action": 1024 * grown / len(steps),
     }

@@ -21,7 +21,7 @@ PLACE = "    hint = given"
 ONE = ("--until", "words", "--video", "cat")
 MANY = int(os.environ.get("BANMO_FAULT_RUNS", "8"))
 FULL_DISKS = int(os.environ.get("BANMO_FULL_DISKS", "4"))
-GC_ROUNDS = int(os.environ.get("BANMO_GC_ROUNDS", "3"))
+GC_ROUNDS = int(os.environ.get("BANMO_GC_ROUNDS", "2"))
 
 
 def sabotage(lab: Lab, *statements: str) -> None:
