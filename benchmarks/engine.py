@@ -1,7 +1,8 @@
 """What the engine itself costs, without any vision: ``python -m benchmarks.engine [--videos 1000] [--actions 100000]``.
 
-Prints, from one run (seconds on the clock, and of the processor where neighbours may slow the clock): the no-op run of a finished workspace (time and memory of a process of its own), the plan of many
-actions of which none has run, and publishing a folder of many files against copying and hashing the same files.
+Prints, from one run (seconds on the clock, and of the processor, for neighbours may slow the clock): the no-op run of a
+finished workspace (time and memory of a process of its own), the plan of many actions of which none has run, and
+publishing a folder of many files against copying and hashing the same files.
 The pipeline is the toy of the engine's tests: three results a video of three small files each, two for all.
 """
 
