@@ -14,7 +14,6 @@ Traps of the cluster that this module answers:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -29,6 +28,7 @@ from pipeline.files import read_json
 from pipeline.local import rank_environment
 
 _REQUEUE_S = 600.0
+_SAVE_S = 100.0
 
 
 class RunRequest:
@@ -62,8 +62,9 @@ class RunRequest:
 
         if self._child is not None and self._child.poll() is None:
             self._pass_on()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._child.wait(timeout=100)
+            deadline = time.monotonic() + _SAVE_S
+            while not _has_ended(self._child.pid) and time.monotonic() < deadline:
+                time.sleep(0.05)
         return DelayedSubmission(RunRequest(self.request, self.log_path))
 
     # ------------------------------------------------------------------ inside
@@ -106,6 +107,14 @@ class RunRequest:
         """Come again later; this process waits until Slurm ends it, because one that ends by itself is finished."""
         subprocess.run(["scontrol", "requeue", os.environ["SLURM_JOB_ID"]], timeout=60, check=False)
         time.sleep(_REQUEUE_S)
+
+
+def _has_ended(pid: int) -> bool:
+    """Whether a child has ended. Asked of the system: within a signal handler, `Popen` waits for what it interrupts."""
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+    except ChildProcessError:
+        return True
 
 
 def _ignore_warnings() -> None:
