@@ -177,7 +177,9 @@ class SlurmJob:
             if self._stop_by is not None and time.monotonic() > self._stop_by:
                 self.kill()
             return None
-        if outcome is None and self._late():
+        # A job that is being requeued shows as failed for a moment; one that was cancelled does not come again.
+        returns = outcome is not None and self._stop_by is None and state is not None and state.may_return
+        if (outcome is None or returns) and self._late():
             return None
         if outcome is None:
             how = f" ({self._told})" if self._told else ""
@@ -242,7 +244,9 @@ def sweep(workspace: Workspace, queue: Queue) -> None:
             attempt = workspace.tmp / note["attempt"]
             outcome = read_outcome(attempt)
             final = outcome is not None and outcome.status != "interrupted"
-            if attempt.is_dir() and not final and queue.is_there(note["job"]):
+            state = queue.state(note["job"])
+            comes = state is not None and (not state.ended or (outcome is not None and state.may_return))
+            if attempt.is_dir() and not final and comes:
                 continue
             remove_tree(attempt)
         path.unlink(missing_ok=True)

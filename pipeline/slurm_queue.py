@@ -28,6 +28,11 @@ class JobState:
         """Whether it will not run (again)."""
         return self.name in _ENDED
 
+    @property
+    def may_return(self) -> bool:
+        """Whether it may still come again: a job that is being requeued shows as failed for a moment."""
+        return self.name != "CANCELLED"
+
 
 class Queue:
     """The user's jobs. When the controller does not answer, what it said last stands."""
