@@ -181,7 +181,7 @@ def tight_probability(
         core, off, close = _rim(found > 0.5, max(1, rim_px - turn))
         weight = core + off * np.where(close, 1.0, 0.15)
         colours = PixelColours(values.shape[-1], effort.seed + 10 + turn)
-        if not colours.fit(values, core, weight, steps=500, mixed=BLENDED_SHARE):
+        if not colours.fit(values, core, weight, steps=300, mixed=BLENDED_SHARE):
             return found
         looks = np.full(found.shape, -6.0, np.float32)
         looks[~off] = colours.logit(values[~off])
