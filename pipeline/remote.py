@@ -19,6 +19,7 @@ from pipeline.errors import BadInput
 from pipeline.files import sha256_file
 from pipeline.objects import digest_of, parse_manifest
 
+_BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "az", "oss")
 _EXTRAS = {"s3": "s3", "s3a": "s3", "sftp": "ssh", "ssh": "ssh"}
 
 
@@ -45,6 +46,7 @@ class Remote:
             raise BadInput(f"this place cannot be reached ({type(error).__name__}: {error})", where=url) from error
         self._root = str(root).rstrip("/")
         self._is_local = protocol == "file"
+        self._is_bucket = protocol in _BUCKETS
 
     # ------------------------------------------------------------------ reading
 
@@ -129,7 +131,7 @@ class Remote:
                 Path(temporary).write_bytes(data)
                 os.replace(temporary, path)
                 return
-            self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+            self._make_folder(path)
             self._fs.pipe_file(path, data)
         except OSError as error:
             raise BadInput(f"it cannot be written ({error})", where=f"{self.url}/{name}") from error
@@ -137,10 +139,15 @@ class Remote:
     def _put(self, source: Path, name: str) -> None:
         path = self._path(name)
         try:
-            self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+            self._make_folder(path)
             self._fs.put_file(str(source), path)
         except OSError as error:
             raise BadInput(f"it cannot be written ({error})", where=f"{self.url}/{name}") from error
+
+    def _make_folder(self, path: str) -> None:
+        """Have the folder of a file. Buckets know no folders, and one that is not there must not be made by a typo."""
+        if not self._is_bucket:
+            self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
 
     def _store_locally(self, parent: Path, digest: str, folder: Path) -> None:
         """Beside its place first, then renamed: others see all of it or nothing."""

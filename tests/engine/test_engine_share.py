@@ -156,6 +156,19 @@ def test_a_bucket(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
         remote.write(name, b"forged")
         third = another(lab, "third")
         assert pull(Workspace.open(third.workspace, create=True), remote).damaged == ["words/cat"]
+
+        # From the command line, where the place and the keys come from the environment as everywhere with S3.
+        for variable, value in (("ACCESS_KEY_ID", "k"), ("SECRET_ACCESS_KEY", "s"), ("DEFAULT_REGION", "us-east-1")):
+            monkeypatch.setenv(f"AWS_{variable}", value)
+        monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
+        outcome = lab.command("push", "s3://cats/second", "--json")
+        assert outcome.code == 0 and outcome.json["folders"] == 4, outcome.err
+        fourth = another(lab, "fourth")
+        outcome = fourth.run("--until", "upper", "--store.shared", "s3://cats/second")
+        assert outcome.code == 0 and "everything is up to date: 4 results" in outcome.out
+        assert fourth.digests() == lab.digests()
+        outcome = lab.command("push", "s3://no-such-bucket/x")
+        assert outcome.code == 2 and outcome.err.count("\n") == 1, outcome.err
     finally:
         server.stop()
 
