@@ -22,8 +22,9 @@ from typing import Any
 
 from filelock import Timeout
 
-from pipeline.contract import Folder, Given, Source, Stage
-from pipeline.describe import bind, build, load_stage, settings_class
+from pipeline.arguments import arguments
+from pipeline.contract import Stage
+from pipeline.describe import bind, load_stage
 from pipeline.errors import (
     FULL,
     FULL_STATUS,
@@ -182,7 +183,7 @@ class Worker:
         out = self._fresh_out()
         found = load_stage(self.request["reference"])
         self._same_code()
-        found.function(**bind(found, found.function, self._arguments(found, out)))
+        found.function(**bind(found, found.function, self._known(found, out)))
         remove_tree(out)
 
     def _fresh_out(self) -> Path:
@@ -200,7 +201,7 @@ class Worker:
         found = load_stage(request["reference"])
         self._same_code()
         self.ranks.call(self.meeting, work=True)
-        known = self._arguments(found, out)
+        known = self._known(found, out)
         found.function(**bind(found, found.function, known))
         for check in found.checks:
             check(**bind(found, check, known))
@@ -228,37 +229,9 @@ class Worker:
         self.workspace.ledger.write(self.record)
         remove_tree(self.workspace.checkpoints / request["key"])
 
-    def _arguments(self, found: Stage, out: Path) -> dict[str, Any]:
-        request = self.request
-
-        patience = Patience(float(request["latency_s"]) if self.workspace.is_far else 0.0)
-
-        def folder(value: dict[str, str]) -> Folder:
-            path = Path(value["path"])
-            patience.until(path.is_dir)  # another machine may have made it just now
-            return Folder(path, value["digest"])
-
-        known: dict[str, Any] = {"out": out, "run": self.context}
-        for name, value in request["inputs"].items():
-            if "folders" in value:
-                known[name] = {v: folder(f) for v, f in sorted(value["folders"].items())}
-            else:
-                known[name] = folder(value["folder"])
-        sources = {
-            v["name"]: Source(Path(v["path"]), v["name"], v["digest"], v["is_folder"]) for v in request["sources"]
-        }
-        given = {
-            v["name"]: Given({s: Path(p) for s, p in v["given"].items()}, v["given_digests"])
-            for v in request["sources"]
-        }
-        only = request["video"]
-        if sources:
-            known["video"] = sources[only] if only else dict(sorted(sources.items()))
-            known["given"] = given[only] if only else dict(sorted(given.items()))
-        kind = settings_class(found)
-        if kind is not None:
-            known["settings"] = build(kind, request["settings"])
-        return known
+    def _known(self, found: Stage, out: Path) -> dict[str, Any]:
+        patience = Patience(float(self.request["latency_s"]) if self.workspace.is_far else 0.0)
+        return arguments(self.request, found, patience) | {"out": out, "run": self.context}
 
     def _same_code(self) -> None:
         """Refuse to file the work of other code under this key."""
