@@ -1,6 +1,7 @@
 """Retargeting as a pipeline of its own: one clip in, the motion of a known model out (``banmo retarget``).
 
-clip -> frames -> masks, flow, features -> poses -> onto (on the known model) -> track (codes) -> motion (files)
+clip -> frames -> masks, flow, features -> poses -> posture (limbs) -> onto (on the known model) -> track (codes)
+     -> motion (files)
 
 It runs in a workspace of its own, so that it is kept, resumed and explained like everything else.
 """
@@ -12,7 +13,8 @@ PIPELINE = (
     "stages.features:features",
     "stages.poses:poses",
     "stages.retarget:known",
-    "stages.retarget:onto",
+    "stages.retarget_posture:posture",
+    "stages.retarget_onto:onto",
     "stages.retarget:track",
     "stages.retarget_motion:motion",
 )

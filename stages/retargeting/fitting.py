@@ -10,6 +10,7 @@ Axes: N frames, P points a frame, V vertices, B bones. Pixels are divided by the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +20,7 @@ from stages.geometry.cameras import project
 from stages.geometry.rotations import so3_exp
 from stages.retargeting.puppet import Puppet, skinned, vertex_turns
 
-
+_LEAST_SPREAD = 0.06  # a point that misses by more than this counts little in the end, in object sizes
 _NORMAL = 0.03  # a normal that points the other way is as bad as being so far off, in object sizes
 
 
@@ -39,7 +40,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Posture:
-    """A fitted puppet. `shape` (B, 3, 3), `orientations` (N, B, 3, 3), `shift` (N, 3), `misfit` (N,) in object sizes."""
+    """A fitted puppet: `shape` (B, 3, 3), `orientations` (N, B, 3, 3), `shift` (N, 3), `misfit` (N,) object sizes."""
 
     shape: Tensor
     orientations: Tensor
@@ -63,14 +64,16 @@ class Effort:
     """Largest change of an angle a step, radians."""
     near: tuple[float, float] = (0.6, 0.05)
     """How far a match may lie from where the puppet is, first and last round, in object sizes."""
-    rest: float = 0.005
+    rest: float = 0.01
     """Price of turning bones."""
-    smooth: float = 0.1
+    smooth: float = 0.3
     """Price of angular acceleration, scaled to the time a limb takes to swing."""
     shape: float = 0.2
     """Price of limbs of other than average length."""
-    inside: float = 1.0
+    inside: float = 3.0
     """Price of vertices that lie off the mask."""
+    hold_root: bool = False
+    """Leave the root's rotation as it is at the start."""
 
 
 def match(
@@ -126,20 +129,22 @@ def weak_misfit(puppet: Puppet, seen: Seen, rotations: Tensor) -> float:
     return float(torch.stack(errors).median()) if errors else float("inf")
 
 
-def fit_clip(puppet: Puppet, seen: Seen, root: Tensor, effort: Effort) -> Posture:
-    """The puppet on the subject of a clip, from root rotations `root` (N, 3, 3), camera from object."""
+def fit_clip(
+    puppet: Puppet, seen: Seen, root: Tensor, effort: Effort, tick: Callable[[int, int], None] | None = None
+) -> Posture:
+    """The puppet on the subject of a clip, from root rotations `root` (N, 3, 3), camera from object.
+
+    `tick` hears of each step taken and of all there will be; it may raise to end the work.
+    """
     count, bones = len(seen.pixels), len(puppet.names)
     focal = float((seen.intrinsics[0, 0] + seen.intrinsics[1, 1]) / 2)
     lengths, girths = torch.zeros(bones), torch.zeros(bones)
     turns, root_turn = puppet.idle.repeat(count, 1, 1), torch.zeros(count, 3)
     shift = _start_shift(puppet, seen, root, focal)
     parameters = [p.requires_grad_() for p in (lengths, girths, turns, root_turn, shift)]
-    rates = [0.5, 0.5, 1.0, 0.5, 0.5]
+    rates = [0.5, 0.5, 1.0, 0.0 if effort.hold_root else 0.5, 0.5]
     descent = torch.optim.Adam(
-        [
-            {"params": [p], "lr": effort.learning_rate * r, "rate": r}
-            for p, r in zip(parameters, rates, strict=True)
-        ],
+        [{"params": [p], "lr": effort.learning_rate * r, "rate": r} for p, r in zip(parameters, rates, strict=True)],
         betas=(0.9, 0.98),
     )
     step_s = float((seen.time_s[1:] - seen.time_s[:-1]).median()) if count > 1 else 1.0
@@ -160,8 +165,10 @@ def fit_clip(puppet: Puppet, seen: Seen, root: Tensor, effort: Effort) -> Postur
             places = (project(seen.intrinsics, moved) - centre) / size
             vertex = match(puppet, places, facing, (seen.pixels - centre) / size, seen.features, near)
         points, weights = puppet.vertices[vertex], puppet.weights[vertex]
-        sigma = max(0.03, 0.5 * near)
+        sigma = max(_LEAST_SPREAD, 0.5 * near)
         for k in range(effort.steps):
+            if tick is not None:
+                tick(turn * effort.steps + k, effort.rounds * effort.steps)
             last = turn == effort.rounds - 1
             for group in descent.param_groups:
                 group["lr"] = effort.learning_rate * group["rate"] * (1 - 0.9 * k / effort.steps if last else 1.0)
@@ -266,7 +273,8 @@ def _similarity(puppet: Puppet, surface: Surface) -> tuple[Tensor, float, Tensor
 
 def _price(puppet: Puppet, turns: Tensor) -> Tensor:
     more = turns - puppet.idle
-    return torch.einsum("nbi,bij,nbj->nb", more, puppet.price, more)[:, 1:].sum(1).mean()
+    square = torch.einsum("nbi,bij,nbj->nb", more, puppet.price, more)[:, 1:]
+    return square.sum(1).mean()
 
 
 def _off_mask(seen: Seen, pixels: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ Axes: N frames, P points of the model's surface, B bones of the puppet.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -65,7 +66,14 @@ def hand_on(puppet: Puppet, rest: Posture, moving: Posture, points: Tensor, weig
     return Handed(root, transform(invert_rigid(root), posed))
 
 
-def follow_points(driven: Banmo, points: Tensor, wanted: Tensor, steps: int, learning_rate: float) -> Tensor:
+def follow_points(
+    driven: Banmo,
+    points: Tensor,
+    wanted: Tensor,
+    steps: int,
+    learning_rate: float,
+    tick: Callable[[int, int, float], None] | None = None,
+) -> Tensor:
     """Move the body motion of a driven model's one video until its surface goes through given places.
 
     The codes move, and the head that turns them into bone motions: it holds the poses that the model was seen in, and
@@ -74,6 +82,7 @@ def follow_points(driven: Banmo, points: Tensor, wanted: Tensor, steps: int, lea
     Args:
         driven: shape, bones, skinning and root are left alone.
         points: (P, 3) of the canonical surface; `wanted` (N, P, 3) object space, at its kept frames.
+        tick: hears of steps taken, of all there will be and of the mean distance left; it may raise to end the work.
 
     Returns:
         (N,) mean distance that is left.
@@ -97,4 +106,6 @@ def follow_points(driven: Banmo, points: Tensor, wanted: Tensor, steps: int, lea
         descent.zero_grad(set_to_none=True)
         loss.backward()
         descent.step()
+        if tick is not None:
+            tick(k + 1, steps, float(loss.detach()))
     return apart.detach().sqrt().mean(1)

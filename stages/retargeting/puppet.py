@@ -34,6 +34,7 @@ class Puppet:
     names: tuple[str, ...]
     parents: tuple[int, ...]  # -1 for the root
     joints: Tensor  # (B, 3): a bone turns about its joint
+    tips: Tensor  # (B, 3)
     axes: Tensor  # (B, 3): from joint to tip, unit length
     twins: Tensor  # (B,) int64: the bone's mirror image; itself in the middle
     idle: Tensor  # (B, 3): rotation vectors of a subject that just stands
@@ -48,7 +49,8 @@ class Puppet:
         """
         names = tuple(str(n) for n in skeleton["names"])
         joints = torch.from_numpy(skeleton["joints"]).float()
-        axes = torch.nn.functional.normalize(torch.from_numpy(skeleton["tips"]).float() - joints, dim=-1)
+        tips = torch.from_numpy(skeleton["tips"]).float()
+        axes = torch.nn.functional.normalize(tips - joints, dim=-1)
         weights = torch.from_numpy(skeleton["weights"]).float()
         twins = [names.index(_mirrored(name)) for name in names]
         return cls(
@@ -59,6 +61,7 @@ class Puppet:
             names=names,
             parents=tuple(int(p) for p in skeleton["parents"]),
             joints=joints,
+            tips=tips,
             axes=axes,
             twins=torch.tensor(twins),
             idle=_idle(names, axes),
@@ -73,7 +76,7 @@ class Puppet:
         return length * along + girth * (torch.eye(3) - along)
 
     def turned(self, root: Tensor, turns: Tensor) -> Tensor:
-        """(N, B, 3, 3) orientation of each bone: `root` (N, 3, 3), then rotation vectors `turns` (N, B, 3) down the tree."""
+        """(N, B, 3, 3) orientation of each bone: `root` (N, 3, 3), then rotation vectors `turns` (N, B, 3)."""
         local = so3_exp(turns)
         found = [root]
         for bone in range(1, len(self.parents)):
@@ -81,7 +84,7 @@ class Puppet:
         return torch.stack(found, 1)
 
     def placed(self, shape: Tensor, orientations: Tensor, shift: Tensor) -> Tensor:
-        """(N, B, 3) joints, the root's at `shift` (N, 3), of bones with stretch `shape` (B, 3, 3) and `orientations`."""
+        """(N, B, 3) joints, the root's at `shift` (N, 3), of bones of a `shape` (B, 3, 3) in `orientations`."""
         found = [shift]
         for bone in range(1, len(self.parents)):
             parent = self.parents[bone]
@@ -97,7 +100,7 @@ class Puppet:
 
 
 def skinned(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Points (N, P, 3) or (P, 3) moved by transforms (N, B, 3, 4) blended with weights (N, P, B) or (P, B): (N, P, 3)."""
+    """Points ([N,] P, 3) moved by transforms (N, B, 3, 4), blended with weights ([N,] P, B): (N, P, 3)."""
     blended = (weights @ transforms.flatten(-2)).unflatten(-1, (3, 4))
     return (blended[..., :3] @ points[..., None]).squeeze(-1) + blended[..., 3]
 

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace, results: Results) -> int:
     words = [str(clip), "--workspace", str(target), "--definition", "stages.retargeting"]
     words += [f"--known.model={fitted}", f"--known.rig={rig.path}"]
     words += ["--preset", args.preset] if args.preset else []
-    words += ["--track.same_subject=true"] if args.same_subject else []
+    words += ["--track.same_subject=true", "--onto.follow=pixels"] if args.same_subject else []
     words += [f"--{name}={text}" for name, text in args.overrides]
     code = run_pipeline(words)
     if code == 0:
