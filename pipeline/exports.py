@@ -6,6 +6,7 @@ them an empty JSON element with the id ``provenance`` is filled with what no res
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import time
@@ -117,6 +118,7 @@ def _keep_foreign(target: Path, fresh: Path, ours: dict[str, Any]) -> None:
 
 
 def _provenance(project: Project, wanted: dict[str, str], results: dict[str, Record]) -> dict[str, Any]:
+    said = {label: words for label, record in results.items() if (words := _texts(record.metrics))}
     return {
         "digests": wanted,
         "videos": {v.name: {"file": v.display, "sha256": project.sources.of(v.path)} for v in project.videos},
@@ -124,7 +126,8 @@ def _provenance(project: Project, wanted: dict[str, str], results: dict[str, Rec
         "actions": {label: record.key for label, record in results.items()},
         "settings": {s: v for s, v in project.settings.values.items() if s in project.definition.stages},
         "files_of_settings": _files_of_settings(project),
-        "said": {label: said for label, record in results.items() if (said := _texts(record.metrics))},
+        "said": said,
+        "networks": _brought_along(project.definition.package_dir, said),
         "software": {name: version for record in results.values() for name, version in record.versions.items()},
     }
 
@@ -132,6 +135,25 @@ def _provenance(project: Project, wanted: dict[str, str], results: dict[str, Rec
 def _texts(metrics: dict[str, Any]) -> dict[str, str]:
     """What a stage recorded in words: which method or network it took, for one."""
     return {name: value for name, value in metrics.items() if isinstance(value, str)}
+
+
+def _brought_along(package_dir: Path, said: dict[str, dict[str, str]]) -> dict[str, dict[str, Any]]:
+    """Files that come with the pipeline and were used: licence, source and digest of each, and by which actions.
+
+    ``weights/about.toml`` beside the pipeline has a table a file; ``known_by`` in it lists what a stage says when it
+    used the file, as ``text`` or ``name=text``.
+    """
+    about = next((f for d in (package_dir, package_dir.parent) if (f := d / "weights" / "about.toml").is_file()), None)
+    if about is None:
+        return {}
+    found: dict[str, dict[str, Any]] = {}
+    for name, table in tomllib.loads(about.read_text(encoding="utf-8")).items():
+        known = set(table.pop("known_by", ()))
+        users = sorted(a for a, words in said.items() if any({v, f"{k}={v}"} & known for k, v in words.items()))
+        if users:
+            digest = hashlib.sha256((about.parent / name).read_bytes()).hexdigest()
+            found[name] = {**table, "sha256": digest, "used_by": users}
+    return found
 
 
 def _files_of_settings(project: Project) -> dict[str, dict[str, Any]]:

@@ -79,7 +79,7 @@ def posture(
     formats.write_json(
         out / "posture.json", {"found": True, "category": category, "why": "", "misfit": round(misfit, 4)}
     )
-    run.metric("category", category)
+    run.metric("limbs", category)
     run.metric("misfit", round(misfit, 4))
 
 

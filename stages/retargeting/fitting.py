@@ -218,7 +218,7 @@ def fit_surface(puppet: Puppet, surface: Surface, effort: Effort) -> Posture:
     rotation, scale, shift = _similarity(puppet, surface)
     lengths, girths = torch.full((bones,), scale).log(), torch.full((bones,), scale).log()
     start = float(lengths[0])
-    turns, root_turn = puppet.idle[None].clone(), torch.zeros(1, 3)
+    turns, root_turn = 0.5 * puppet.idle[None], torch.zeros(1, 3)
     parameters = [p.requires_grad_() for p in (lengths, girths, turns, root_turn, shift)]
     descent = torch.optim.Adam(parameters, lr=effort.learning_rate, betas=(0.9, 0.98))
     misfit = torch.zeros(1)

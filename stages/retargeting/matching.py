@@ -14,7 +14,7 @@ from stages.retargeting.puppet import Puppet
 ALIKE = 0.85
 """Least median cosine between a model's embedding and its nearest ones on the canonical surface."""
 _POINTS = 1200
-_ON_MODEL = Effort(rounds=12, steps=25)
+_ON_MODEL = Effort(rounds=12, steps=30, rest=0.0005, learning_rate=0.03)
 
 
 def model_surface(model: Banmo) -> Surface:
