@@ -12,7 +12,7 @@ import torch
 
 from pipeline import BadInput, Folder, Given, Resources, Run, Scene, stage
 from stages import formats
-from stages.own_networks import CATEGORIES, OwnNetwork
+from stages.own_networks import CATEGORIES, OwnNetwork, canonical_surface
 from stages.perception.viewpoint import AZIMUTH_DEG, ELEVATION_DEG, ROLL_DEG, angle_log_probabilities
 from stages.registration.answer import Answer, Provider, Subject, ViewBelief
 from stages.registration.combine import combine
@@ -29,12 +29,13 @@ from stages.registration.placing import (
 )
 from stages.registration.search import search
 from stages.registration.seen import seen
-from stages.registration.sheets import draw_pose, pose_sheet
+from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
 CROP_PX = 48
 EMBEDDING_CHANNELS = 4
+OTHER = "other"
 APPEARANCE_ONLY = "builtin-appearance"
 """What features.json calls an embedding made of colours and edges, which the search sees anyway."""
 LOW_TRUST = 0.5
@@ -88,9 +89,11 @@ def poses(
         )
     tried: list[dict[str, object]] = []
     answers: dict[str, Answer] = {}
+    category = OTHER
     if asked:
         basis = _embedding_basis(features)
         network = _network(features, run)
+        category = OTHER if network is None else network.category
         subjects = []
         for n in clips:
             subject = _subject(n, clips[n], masks[n], flow[n], features[n], basis, settings, tracks.get(n), run)
@@ -99,7 +102,7 @@ def poses(
         tracks |= {s.name: _track(s, answers[s.name]) for s in subjects if s.name in answers}
     for name, clip in clips.items():
         formats.write_poses(out / f"{name}.json", tracks[name], clip)
-    _summarise(clips, tracks, answers, tried, settings, out, run)
+    _summarise(clips, tracks, answers, tried, category, settings, out, run)
 
 
 def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
@@ -145,17 +148,17 @@ def category_of(verdicts: list[dict[str, Any]]) -> str:
     """The category that most clips' features.json name, each weighted by its margin; "other" if none is ours."""
     votes: dict[str, float] = {}
     for verdict in verdicts:
-        name = str(verdict.get("category", "other"))
+        name = str(verdict.get("category", OTHER))
         votes[name] = votes.get(name, 0.0) + 0.05 + max(float(verdict.get("margin", 0.0)), 0.0)
     best = max(votes, key=lambda name: votes[name])
-    return best if best in CATEGORIES else "other"
+    return best if best in CATEGORIES else OTHER
 
 
 def _network(features: dict[str, Folder], run: Run) -> OwnNetwork | None:
     """The view network of the collection's category; None where we have none."""
     category = category_of([formats.read_json(folder / "features.json") for folder in features.values()])
     run.metric("category", category)
-    return None if category == "other" else OwnNetwork(category, device=run.device, threads=run.threads)
+    return None if category == OTHER else OwnNetwork(category, device=run.device, threads=run.threads)
 
 
 def _view(clip: formats.Clip, masks: Folder, network: OwnNetwork, chunk: int = 32) -> ViewBelief:
@@ -260,6 +263,7 @@ def _summarise(
     tracks: dict[str, formats.PoseTrack],
     answers: dict[str, Answer],
     tried: list[dict[str, object]],
+    category: str,
     settings: PosesSettings,
     out: Path,
     run: Run,
@@ -286,6 +290,7 @@ def _summarise(
             "providers_tried": tried or [{"provider": "given"}],
             "won": {name: v["provider"] for name, v in videos.items()},
             "videos": videos,
+            "category": category,
             "trust": round(trust, 4),
             "advice": "" if not doubtful else f"check {', '.join(doubtful)} with `inspect poses`, or give root poses",
         },
@@ -307,13 +312,21 @@ def _check(out: Path, frames: dict[str, Folder]) -> None:
 
 @poses.sheet
 def _sheet(out: Path, frames: dict[str, Folder], picture: Path) -> None:
-    """Each clip's frames with the object's axes and horizon drawn in the estimated pose."""
+    """Each clip's frames with the category's surface, or axes and horizon, drawn in the estimated pose."""
     rows = []
-    verdict = formats.read_json(out / "poses.json")["videos"]
+    summary = formats.read_json(out / "poses.json")
+    verdict, category = summary["videos"], summary.get("category", OTHER)
+    surface = canonical_surface(category) if category in CATEGORIES else None
     for name, folder in frames.items():
         clip, track = formats.read_clip(folder.path), formats.read_poses(out / f"{name}.json")
         pick = np.unique(np.round(np.linspace(0, len(clip) - 1, min(9, len(clip)))).astype(int))
-        drawn = [draw_pose(clip.image(i), track.intrinsics, track.object_to_camera[i]) for i in pick]
+        drawn = []
+        for i in pick:
+            image, pose = clip.image(i), track.object_to_camera[i]
+            # Only the network's answers stand in the frame of the category's surface.
+            if surface is not None and verdict[name]["provider"] == "network":
+                image = draw_surface(image, track.intrinsics, pose, surface["vertices"], surface["faces"])
+            drawn.append(draw_pose(image, track.intrinsics, pose))
         title = f"{name}: {verdict[name]['provider']}, trust {100 * verdict[name]['trust']:.0f} %"
         rows.append((title, drawn, track.confidence[pick]))
     formats.write_image(picture, pose_sheet(rows))

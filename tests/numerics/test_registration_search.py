@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from stages.registration.answer import Subject
@@ -13,7 +14,7 @@ from stages.registration.cues import inflate
 from stages.registration.model import Hypothesis, Weights
 from stages.registration.placing import default_intrinsics, depth_from_size, view_angles
 from stages.registration.search import Effort, agreement, choose_frames, make_sequences, search, spread
-from stages.registration.sheets import draw_pose, pose_sheet
+from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
 from stages.registration.turning import expected_turns, row_turns, turn_rates
 from stages.registration.upright import upright
 from stages.registration.volume import ViewBank
@@ -150,3 +151,20 @@ def test_pictures_show_where_the_axes_point() -> None:
     sheet = pose_sheet([("one", [drawn] * 12, np.ones(12)), ("two", [drawn] * 3, np.zeros(3))], height=40, columns=5)
     assert sheet.shape == (2 * (40 + 18), 5 * 50, 3)
     assert len(BEAST) == 7
+
+
+def test_a_surface_is_drawn_where_it_stands_and_shows_its_front() -> None:
+    intrinsics = default_intrinsics(100, 80, 100.0)
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0])  # seen from the front
+    pose[2, 3] = 3.0
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-1.0, 1.0)])
+    faces = ConvexHull(corners).simplices
+    blank = np.zeros((80, 100, 3), np.uint8)
+    front = draw_surface(blank, intrinsics, pose, corners, faces)
+    assert front[40, 50, 2] > 1.5 * front[40, 50, 0] and not front[5].any() and not blank.any()
+    turned = pose.copy()
+    turned[:3, :3] = np.diag([-1.0, -1.0, 1.0])  # from behind
+    assert draw_surface(blank, intrinsics, turned, corners, faces)[40, 50, 2] < 0.7 * front[40, 50, 2]
+    pose[2, 3] = 0.5  # it reaches behind the camera
+    assert not draw_surface(blank, intrinsics, pose, corners, faces).any()
