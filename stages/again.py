@@ -1,7 +1,8 @@
-"""Running the pipeline from within a command: a child of the same program, with its own progress and exit code."""
+"""What several commands share: running the pipeline from within one, and the flag that names the model."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -20,3 +21,15 @@ def run_pipeline(words: Sequence[str]) -> int:
             return child.wait()
         except KeyboardInterrupt:
             continue
+
+
+def add_model(parser: argparse.ArgumentParser, done: str) -> None:
+    """``--model DIR``: another name of ``--workspace`` for verbs to whose model something is `done`."""
+    parser.add_argument(
+        "--model",
+        type=Path,
+        dest="workspace",
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help=f"the workspace whose model is {done}; the same as --workspace",
+    )

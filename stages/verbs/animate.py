@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline import BadInput, Results
+from stages.again import add_model
 
 if TYPE_CHECKING:
     from stages.animating.transfer import Motion
@@ -27,14 +28,7 @@ _MOST_BYTES = 500_000_000
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Flags."""
     add = parser.add_argument
-    add(
-        "--model",
-        type=Path,
-        dest="workspace",
-        default=argparse.SUPPRESS,
-        metavar="DIR",
-        help="the workspace whose model is moved; the same as --workspace",
-    )
+    add_model(parser, "moved")
     add("--from", type=Path, required=True, dest="source", metavar="FILE", help="a .bvh or a .glb with a skeleton")
     add("--clip", metavar="NAME", help="which animation of a GLB (default: the first)")
     add("--map", type=Path, metavar="FILE", help="JSON: names of our joints -> names of theirs; others match by name")

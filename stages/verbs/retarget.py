@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from pipeline import BadInput, Results
-from stages.again import run_pipeline
+from stages.again import add_model, run_pipeline
 
 SUMMARY = "drive the model by another clip: its motion becomes one more animation"
 EXAMPLES = (
@@ -28,14 +28,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Flags."""
     add = parser.add_argument
     add("--video", type=Path, required=True, metavar="CLIP", help="the clip that drives: one video file")
-    add(
-        "--model",
-        type=Path,
-        dest="workspace",
-        default=argparse.SUPPRESS,
-        metavar="DIR",
-        help="the workspace whose model is driven; the same as --workspace",
-    )
+    add_model(parser, "driven")
     add("--to", type=Path, metavar="DIR", help="default: retarget/<clip> in that workspace")
     add("--preset", metavar="NAME", help="preview (minutes), standard or fine")
     add("--same-subject", action="store_true", help="the clip shows the very subject of the model: its colours count")

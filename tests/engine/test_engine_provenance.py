@@ -17,7 +17,8 @@ def test_only_what_was_used_is_named_and_by_whom(tmp_path: Path) -> None:
     (tmp_path / "weights" / "a.bin").write_bytes(b"a")
     (tmp_path / "weights" / "b.bin").write_bytes(b"b")
     (tmp_path / "weights" / "about.toml").write_text(
-        '["a.bin"]\nlicence = "MIT"\nknown_by = ["a.bin", "kind=cat"]\n["b.bin"]\nlicence = "MIT"\nknown_by = ["b.bin"]\n'
+        '["a.bin"]\nlicence = "MIT"\nknown_by = ["a.bin", "kind=cat"]\n'
+        '["b.bin"]\nlicence = "MIT"\nknown_by = ["b.bin"]\n'
     )
     said = {"words/one": {"network": "a.bin"}, "words/two": {"kind": "cat"}, "final": {"sort": "cat"}}
     expected = {"licence": "MIT", "sha256": hashlib.sha256(b"a").hexdigest(), "used_by": ["words/one", "words/two"]}
