@@ -9,12 +9,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock
-
 from pipeline.console import size
 from pipeline.definition import load
 from pipeline.errors import PipelineError
 from pipeline.local import machine_cpus, machine_gpus
+from pipeline.locks import EXPIRING, KERNEL, Locks, on_network
 from pipeline.project import Options
 from pipeline.workspace import Workspace
 
@@ -57,8 +56,10 @@ def _disk(root: Path) -> list[Row]:
             skew = abs(probe.stat().st_mtime - time.time())
             rows.append(Row("clock", skew < 2, f"the disk's clock is {skew:.1f} s away from the machine's"))
             rows.append(_links(folder))
-            with FileLock(folder / "lock").acquire(timeout=5):
-                rows.append(Row("locks", True, "work here"))
+            locks = Locks(EXPIRING if on_network(folder) else KERNEL)
+            with locks.at(folder / "lock").acquire(timeout=5):
+                kind = "the kernel's" if locks.kind == KERNEL else "leases that expire, for this is a network disk"
+                rows.append(Row("locks", True, f"work here: {kind}"))
         return rows
     except OSError as error:
         return [Row("disk", False, f"{root} cannot be written ({error.strerror})")]

@@ -285,7 +285,7 @@ def _versions() -> dict[str, str]:
     """Versions of Python and of the libraries this action has loaded."""
     found = {"python": sys.version.split()[0]}
     for name, module in sorted(sys.modules.items()):
-        version = getattr(module, "__version__", None)
+        version = getattr(module, "__dict__", {}).get("__version__")  # asking the module itself may warn
         ours = "." in name or name.startswith("_") or name in sys.stdlib_module_names
         if not ours and isinstance(version, str):
             found[name] = version
