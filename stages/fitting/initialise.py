@@ -88,8 +88,11 @@ def swept(hull_: Hull, share: float) -> Tensor | None:
     return hull_.nodes[wide]
 
 
-def place_bones(points: Tensor, count: int, seed: int) -> Bones:
+def place_bones(points: Tensor, count: int, seed: int, along: bool = False) -> Bones:
     """Bones among surface points (N, 3): farthest points first, then a few rounds of k-means.
+
+    They hang in a tree by their distance through the body; `along`: by the way along the points, which suits a shape
+    whose limbs have grown. A first hull has none yet, and limbs grow from a tree of straight links.
 
     Farthest points reach the ends of thin limbs, which k-means alone, ruled by mass, leaves without a bone. Each
     bone is as wide as 0.45 of the way to its neighbours.
@@ -111,7 +114,7 @@ def place_bones(points: Tensor, count: int, seed: int) -> Bones:
         width = gaps.topk(min(3, count - 1), largest=False).values.mean(1)
     else:
         width = torch.full((1,), float(points.std()))
-    order, parents = bone_tree(_tree_distance(centres_t, points))
+    order, parents = bone_tree((_way_along if along else _straight_through)(centres_t, points))
     return Bones(centres_t[order], torch.log(0.45 * width)[order, None].expand(count, 3).clone(), parents)
 
 
@@ -130,7 +133,17 @@ def body_of(points: Tensor) -> Tensor:
     return points[torch.from_numpy(part == np.bincount(part).argmax())]
 
 
-def _tree_distance(centres: Tensor, points: Tensor) -> Tensor:
+def _straight_through(centres: Tensor, points: Tensor) -> Tensor:
+    """Distance (B, B) between bones that counts leaving the body thrice: halfway points far from `points` cost."""
+    straight = torch.cdist(centres, centres)
+    share = torch.linspace(0.25, 0.75, 3)[:, None, None, None]
+    between = centres[None, :, None] * (1 - share) + centres[None, None] * share
+    some = points[:: max(1, len(points) // 1500)]
+    gap = torch.cdist(between.reshape(-1, 3), some).amin(1).reshape(between.shape[:-1]).amax(0)
+    return straight + 3 * (gap - 0.5 * gap.diagonal()[:, None]).clamp_min(0)
+
+
+def _way_along(centres: Tensor, points: Tensor) -> Tensor:
     """Distance (B, B) between bones along the body: two paws that stand side by side are a long way apart.
 
     It is the way through neighbouring `points` (N, 3), no shorter than the straight line; where there is none, thrice

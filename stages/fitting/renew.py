@@ -52,7 +52,8 @@ def change_bones(model: Banmo, bones: Bones, points: Tensor, seed: int, steps: i
 def renew_bones(model: Banmo, seed: int) -> float:
     """Place the bones anew on ``model.surface``; returns what :func:`change_bones` does."""
     body = body_of(model.surface.cpu())
-    return change_bones(model, place_bones(body, len(model.bones), seed).to(model.surface.device), model.surface, seed)
+    bones = place_bones(body, len(model.bones), seed, along=True).to(model.surface.device)
+    return change_bones(model, bones, model.surface, seed)
 
 
 def renew_bounds(model: Banmo, margin: float) -> bool:

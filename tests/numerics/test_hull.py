@@ -181,7 +181,7 @@ def horseshoe() -> torch.Tensor:
 
 
 def test_a_tree_of_bones_goes_along_the_body_not_from_paw_to_paw() -> None:
-    bones = initialise.place_bones(horseshoe(), 9, seed=0)
+    bones = initialise.place_bones(horseshoe(), 9, seed=0, along=True)
     centres, parents = bones.centres.detach(), bones.parents.tolist()
     for bone, parent in enumerate(parents):
         crosses = centres[bone, 0] * centres[parent, 0] < 0 and abs(float(centres[bone, 0])) > 0.03
