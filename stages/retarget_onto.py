@@ -109,7 +109,8 @@ def _limbs(known: Folder, frames: dict[str, Folder], poses: Folder, posture: Fol
     alike = likeness(puppet, surface)
     run.metric("likeness", round(alike, 4))
     if alike < ALIKE:
-        return f"the model was not fitted with our network for this category (likeness {alike:.2f} of {ALIKE})"
+        share = f"its embedding agrees on {100 * alike:.0f} % of it"
+        return f"the model was not fitted with our network for this category ({share})"
     name, folder = next(iter(frames.items()))
     clip = formats.read_clip(folder.path)
     moving = read_posture(posture.path, len(clip))

@@ -34,7 +34,7 @@ _SHEET_FRAMES, _SHEET_PX = 8, 256
 class PostureSettings:
     """How the driving subject's limbs are found."""
 
-    rounds: int = 8
+    rounds: int = 12
     """How often pixels look for their points on the body anew."""
     steps: int = 20
     """Steps of descent in between."""

@@ -56,13 +56,13 @@ class Posture:
 class Effort:
     """How long and how stiffly a puppet is fitted."""
 
-    rounds: int = 8
+    rounds: int = 12
     """Matchings."""
     steps: int = 20
     """Steps of descent a round."""
     learning_rate: float = 0.02
     """Largest change of an angle a step, radians."""
-    near: tuple[float, float] = (0.6, 0.05)
+    near: tuple[float, float] = (0.15, 0.06)
     """How far a match may lie from where the puppet is, first and last round, in object sizes."""
     rest: float = 0.01
     """Price of turning bones."""
@@ -215,7 +215,7 @@ def fit_surface(puppet: Puppet, surface: Surface, effort: Effort) -> Posture:
     features = surface.features[None]
     target = surface.points[None]
     size = float((surface.points.amax(0) - surface.points.amin(0)).max())
-    rotation, scale, shift = _similarity(puppet, surface)
+    rotation, scale, shift = lay(puppet, surface)
     lengths, girths = torch.full((bones,), scale).log(), torch.full((bones,), scale).log()
     start = float(lengths[0])
     turns, root_turn = 0.5 * puppet.idle[None], torch.zeros(1, 3)
@@ -252,7 +252,7 @@ def fit_surface(puppet: Puppet, surface: Surface, effort: Effort) -> Posture:
         return Posture(puppet.shape(lengths, girths), orientations, shift.detach(), misfit)
 
 
-def _similarity(puppet: Puppet, surface: Surface) -> tuple[Tensor, float, Tensor]:
+def lay(puppet: Puppet, surface: Surface) -> tuple[Tensor, float, Tensor]:
     """Rotation (1, 3, 3), scale and root joint (1, 3) that lay the puppet on the surface by its embedding alone."""
     vertex = (surface.features @ puppet.embedding.T).argmax(1)
     x, y = puppet.vertices[vertex], surface.points

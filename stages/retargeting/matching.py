@@ -7,14 +7,15 @@ from torch import Tensor
 
 from stages.model.banmo import Banmo
 from stages.retargeting.articulation import spread
-from stages.retargeting.fitting import Effort, Posture, Surface, fit_surface
+from stages.retargeting.fitting import Effort, Posture, Surface, fit_surface, lay
 from stages.retargeting.handing import Handed, hand_on, hang
 from stages.retargeting.puppet import Puppet
 
-ALIKE = 0.85
-"""Least median cosine between a model's embedding and its nearest ones on the canonical surface."""
+ALIKE = 0.6
+"""Least share of a model's surface that its embedding alone sends to about the right place on the canonical surface."""
+_ABOUT = 0.25  # so near, where the object is 2 long
 _POINTS = 1200
-_ON_MODEL = Effort(rounds=12, steps=30, rest=0.0005, learning_rate=0.03)
+_ON_MODEL = Effort(rounds=12, steps=30, near=(0.6, 0.05), rest=0.0005, learning_rate=0.03)
 
 
 def model_surface(model: Banmo) -> Surface:
@@ -27,8 +28,14 @@ def model_surface(model: Banmo) -> Surface:
 
 
 def likeness(puppet: Puppet, surface: Surface) -> float:
-    """Median cosine of the surface's embedding with the nearest of the puppet; near one if one network made both."""
-    return float((surface.features @ puppet.embedding.T).amax(1).median())
+    """Share of the surface that a rigid motion and a scale lay on the vertices its embedding names.
+
+    Near one if the embedding is this category's, whatever the model's build; hardly anything if it is another's.
+    """
+    rotation, scale, joint = lay(puppet, surface)
+    vertex = (surface.features @ puppet.embedding.T).argmax(1)
+    there = scale * (puppet.vertices[vertex] - puppet.joints[0]) @ rotation[0].T + joint
+    return float(((there - surface.points).norm(dim=1) < _ABOUT).float().mean())
 
 
 def handed(puppet: Puppet, surface: Surface, moving: Posture) -> tuple[Handed, float]:
