@@ -53,8 +53,6 @@ class MaskSettings:
     """Probability above which a pixel counts as the object, for boxes, areas and flags."""
     category: str = "auto"
     """quadruped or human: a network of ours that knows it helps; other: none does; auto: whichever fits what moves."""
-    refinements: int = 2
-    """How often a network of ours goes over the built-in segmentation's rough masks; 0 leaves them rough."""
     seed: int = 0
     """Seed of the built-in segmentation."""
     network: InputFile = NO_FILE
@@ -79,7 +77,7 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        effort = Effort(refinements=settings.refinements, seed=settings.seed)
+        effort = Effort(seed=settings.seed)
         images = clip.images()
         priors = _priors(images, settings.category, run)
         result = segment(images, hints, effort, tick=_ticker(run), priors=priors)

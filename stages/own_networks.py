@@ -38,20 +38,6 @@ class OwnNetwork:
         return dict(zip(self._outputs, self._session.run(None, {"input": inputs.astype(np.float32)}), strict=True))
 
 
-class OwnRefiner:
-    """The network that makes rough masks exact (see stages.perception.refining.RefiningNetwork)."""
-
-    name = "refine.onnx"
-
-    def __init__(self, *, device: str = "cpu", threads: int = 1) -> None:
-        self._session = _session(self.name, device, threads)
-
-    def __call__(self, inputs: np.ndarray) -> np.ndarray:
-        """(N, S, S) logits of (N, 4, S, S) float32, S a multiple of 16."""
-        (logit,) = self._session.run(["logit"], {"input": inputs.astype(np.float32)})
-        return np.asarray(logit[:, 0])
-
-
 def _session(name: str, device: str, threads: int) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = max(1, threads)

@@ -113,7 +113,7 @@ def test_a_mask_setting_reruns_masks_and_followers_but_not_flow(clips: Path, con
     shutil.copytree(contracts, workspace / "cache")
     for k in (0, 1):  # no masks beside these: what the setting governs decides
         shutil.copyfile(clips / f"cat-0{k}.mp4", videos / f"cat-0{k}.mp4")
-    quick = "--masks.refinements=0"
+    quick = "--masks.seed=0"
     first = run_banmo("run", videos, "--workspace", workspace, "--until", "features", quick)
     assert first.code == 0, first.text
     assert ran(first) == {"frames", "masks", "flow", "features"}
