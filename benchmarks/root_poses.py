@@ -94,7 +94,7 @@ def by_pnp(clips: dict[str, Clip], features: dict[str, Folder], category: str, s
                     reprojectionError=PNP_ERROR_SHARE * float(crop[2] - crop[0]),
                 )  # fmt: skip
                 if ok:
-                    rotations.append(cv2.Rodrigues(turn)[0])
+                    rotations.append(np.asarray(cv2.Rodrigues(turn)[0], np.float64))
                     continue
             rotations.append(rotations[-1])
         out[name] = np.stack(rotations[1:])

@@ -217,7 +217,7 @@ def _subject(
         return Subject(name, cues, intrinsics, frame=frame)
     turned = ray_rotation(centre, track.intrinsics).transpose(0, 2, 1)
     rotation, depth = turned @ track.object_to_camera[:, :3, :3], track.object_to_camera[:, 2, 3]
-    return Subject(name, cues, track.intrinsics, rotation, depth, frame)
+    return Subject(name, cues, track.intrinsics, rotation, depth, frame=frame)
 
 
 def _ask(

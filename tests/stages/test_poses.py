@@ -160,6 +160,23 @@ def test_upright_is_always_an_answer_and_never_boasts(tmp_path: Path, clips: dic
     assert summary["trust"] == pytest.approx(0.05) and "a, b" in summary["advice"]
 
 
+def test_a_clip_with_given_poses_brings_its_pictures_along_and_no_view(
+    tmp_path: Path, clips: dict[str, np.ndarray], monkeypatch: Any
+) -> None:
+    seen: dict[str, Subject] = {}
+
+    def provider(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
+        seen.update({s.name: s for s in subjects})
+        return {}
+
+    monkeypatch.setitem(stage_module.PROVIDERS, "search", provider)
+    run_poses(tmp_path, {"a": save(tmp_path, "a", document(clips["a"]))}, provider="search")
+    assert seen["a"].rotation is not None and seen["b"].rotation is None
+    for subject in seen.values():
+        assert subject.view is None and subject.frame is not None
+        assert subject.frame(0)[0].shape[2] == 3
+
+
 def test_the_most_trusted_provider_wins_and_others_fill_in(
     tmp_path: Path, clips: dict[str, np.ndarray], monkeypatch: Any
 ) -> None:
