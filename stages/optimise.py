@@ -58,11 +58,11 @@ class FitSettings(PhaseSettings):
     """Folder of an earlier model of the same subject to go on from, with clips added; see `banmo extend`."""
     margin: float = 0.3
     """Room for limbs around the first hull (object about 2 long)."""
-    renew_at: float = 2.0
+    renew_at: float = 0.3
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
-    motion_spacing_s: float = 0.0
+    motion_spacing_s: float = 0.1
     """Spacing of local functions of time in the pose codes, beside the waves; 0 = waves alone, as in the paper."""
     pose_code: int = 96
     """Channels of the pose codes."""
@@ -76,9 +76,9 @@ class FitSettings(PhaseSettings):
     """At the end, move to the root poses what all bones share, so that the trunk rests in object space."""
     lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
-    decay_from: float = 0.5
+    decay_from: float = 0.6
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
-    weight_cover: float = 0.0
+    weight_cover: float = 0.02
     """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag."""
     cover_from: float = 0.3
     """Share of the phase from which they do; before, limbs may not be there yet."""
