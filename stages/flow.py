@@ -97,9 +97,7 @@ def _steps(settings: FlowSettings, clip: Clip) -> tuple[int, ...]:
     return steps or (1,)
 
 
-def _provider(
-    clip: Clip, settings: FlowSettings, steps: tuple[int, ...], run: Run
-) -> tuple[str, Iterator[FlowPair]]:
+def _provider(clip: Clip, settings: FlowSettings, steps: tuple[int, ...], run: Run) -> tuple[str, Iterator[FlowPair]]:
     if settings.network:
         network = FlowNetwork(settings.network, settings.network_contract, device=run.device, threads=run.threads)
         run.log.info("%s on %s", network.name, network.on)

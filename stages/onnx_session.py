@@ -12,10 +12,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import onnxruntime
+from onnxruntime import InferenceSession
 
 from pipeline import BadInput
 from stages.contracts import PICTURE, Contract, locate, read_contract
+from stages.onnx_runtime import open_session
 from stages.onnx_safety import HUGE, inspect
 
 MAX_BYTES = 2_000_000_000
@@ -119,7 +120,7 @@ class Network:
         return results
 
 
-def _session(path: Path, device: str, threads: int) -> onnxruntime.InferenceSession:
+def _session(path: Path, device: str, threads: int) -> InferenceSession:
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -135,15 +136,8 @@ def _session(path: Path, device: str, threads: int) -> onnxruntime.InferenceSess
         raise BadInput(f"{path.name} uses operators of {found.foreign[0]!r}, which are not onnxruntime's own")
     if found.largest > HUGE:
         raise BadInput(f"{path.name} holds or makes a tensor of {found.largest:,} elements, too large to be meant")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = max(1, threads)
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
-    providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=providers)
+        return open_session(path, device, threads)
     except Exception as error:  # onnxruntime raises a family of untyped errors
         raise BadInput(f"{path.name} cannot be opened as an ONNX network", hint=_first_line(error)) from error
 

@@ -6,7 +6,8 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
+
+from stages.onnx_runtime import open_session
 
 WEIGHTS = Path(__file__).parent / "weights"
 CATEGORIES = ("quadruped", "human")
@@ -29,24 +30,13 @@ class OwnNetwork:
     def __init__(self, category: str, *, device: str = "cpu", threads: int = 1) -> None:
         self.category = category
         self.name = f"posenet-{category}.onnx"
-        self._session = _session(self.name, device, threads)
+        self._session = open_session(_read(self.name), device, threads)
         self.providers: list[str] = self._session.get_providers()
         self._outputs = [o.name for o in self._session.get_outputs()]
 
     def __call__(self, inputs: np.ndarray) -> dict[str, np.ndarray]:
         """`view` (N, 60), `dense` (N, 17, 48, 48), `category` (N, 3) of (N, 4, 96, 96) float32."""
         return dict(zip(self._outputs, self._session.run(None, {"input": inputs.astype(np.float32)}), strict=True))
-
-
-def _session(name: str, device: str, threads: int) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = max(1, threads)
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
-    providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
-    return onnxruntime.InferenceSession(_read(name), options, providers=providers)
 
 
 def canonical_surface(category: str) -> dict[str, np.ndarray]:
