@@ -95,6 +95,9 @@ def follow_points(
     rates = (learning_rate, 0.1 * learning_rate)
     descent = torch.optim.Adam([{"params": p, "lr": r} for p, r in zip((codes, head), rates, strict=True)])
     frames = torch.arange(len(wanted))
+    of = driven.rest_weights(points).argmax(1)
+    share = torch.bincount(of)[of].float().rsqrt()  # a thin arm has few points and counts all the same
+    share = share / share.sum()
     apart = torch.zeros(len(wanted))
     for k in range(steps):
         for group, rate in zip(descent.param_groups, rates, strict=True):
@@ -102,7 +105,7 @@ def follow_points(
         state = driven.frames(frames)
         posed = driven.forward_points(state, points[None].expand(len(wanted), -1, -1))
         apart = (posed - wanted).square().sum(-1)
-        loss = (apart + 1e-6).sqrt().mean()
+        loss = ((apart + 1e-6).sqrt() * share).sum(1).mean()
         descent.zero_grad(set_to_none=True)
         loss.backward()
         descent.step()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from stages.model.banmo import Banmo
@@ -15,12 +18,22 @@ ALIKE = 0.6
 """Least share of a model's surface that its embedding alone sends to about the right place on the canonical surface."""
 _ABOUT = 0.25  # so near, where the object is 2 long
 _POINTS = 1200
+_LINK = 0.1  # surface points this near belong together, where the object is 2 long
 _ON_MODEL = Effort(rounds=12, steps=30, near=(0.6, 0.05), rest=0.0005, learning_rate=0.03)
+
+
+def _largest_piece(points: Tensor) -> Tensor:
+    """(M,) which points of a surface belong to its largest connected piece; crumbs of a field lie anywhere."""
+    pairs = cKDTree(points.numpy()).query_pairs(_LINK, output_type="ndarray")
+    links = sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
+    _, label = sparse.csgraph.connected_components(links, directed=False)
+    return torch.from_numpy(label == np.bincount(label).argmax())
 
 
 def model_surface(model: Banmo) -> Surface:
     """Points of the model's surface at rest, their normals (gradient of the signed distance) and embedding."""
-    points = model.surface[spread(len(model.surface), _POINTS)]
+    surface = model.surface[_largest_piece(model.surface)]
+    points = surface[spread(len(surface), _POINTS)]
     step = 0.5 * model.architecture.voxel
     sides = [model.sdf(points + d) - model.sdf(points - d) for d in step * torch.eye(3)]
     normals = torch.nn.functional.normalize(torch.stack(sides, -1), dim=-1)
