@@ -17,7 +17,7 @@ from stages.model.banmo import Banmo
 
 
 @torch.no_grad()
-def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25, steady_s: float = 0.2) -> float:
+def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25, steady_s: float = 0.1) -> float:
     """Set ``model.gauge`` so that the surface moves least in object space; given root poses stay as they are.
 
     `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
