@@ -73,8 +73,8 @@ def test_garbage_on_every_channel_changes_nothing(lab: Lab) -> None:
         "sys.stdout.buffer.write(os.urandom(1 << 20)); sys.stdout.buffer.flush()",
         "sys.stderr.buffer.write(b'\\x1b[2J\\x00\\xff' * 1000); sys.stderr.buffer.flush()",
         "open('events.jsonl', 'ab').write(b'{torn\\n[]\\n7\\n\\xff\\xfe\\n' + b'[' * 100000 + b'\\n{\"event\": 7}\\n')",
-        "open('events.jsonl', 'ab').write(b'{\"event\": \"progress\", \"done\": \"x\", \"total\": []}\\n')",
-        "open('events.jsonl', 'ab').write(b'{\"event\": \"done\"}\\n{\"event\": \"launched\", \"label\": 3}\\n')",
+        'open(\'events.jsonl\', \'ab\').write(b\'{"event": "progress", "done": "x", "total": []}\\n\')',
+        'open(\'events.jsonl\', \'ab\').write(b\'{"event": "done"}\\n{"event": "launched", "label": 3}\\n\')',
         "Path('meet-alone.json').write_text('{')",
         "os.mkfifo('pipe'); os.chdir('/')",
     )

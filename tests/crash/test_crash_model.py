@@ -70,8 +70,18 @@ class StoreModel(RuleBasedStateMachine):
         made = action(stage="s", version=1, code="c", settings={"n": number, "t": text}, inputs={})
         self.workspace.ledger.write(
             Record(
-                key=made.key, stage="s", video=None, action=made.text, modules={}, digest=stored.digest, files=2,
-                bytes=stored.bytes, seconds=1.0, started=_STAMP, finished=_STAMP, run="model",
+                key=made.key,
+                stage="s",
+                video=None,
+                action=made.text,
+                modules={},
+                digest=stored.digest,
+                files=2,
+                bytes=stored.bytes,
+                seconds=1.0,
+                started=_STAMP,
+                finished=_STAMP,
+                run="model",
             )
         )
         self.content[stored.digest] = files

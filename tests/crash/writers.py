@@ -65,8 +65,18 @@ def make(workspace: Workspace, work: Work) -> None:
         stored = workspace.objects.publish("soak", out)
         workspace.ledger.write(
             Record(
-                key=key, stage="soak", video=None, action=work.action.text, modules={}, digest=stored.digest,
-                files=stored.files, bytes=stored.bytes, seconds=0.1, started=_STAMP, finished=_STAMP, run="soak",
+                key=key,
+                stage="soak",
+                video=None,
+                action=work.action.text,
+                modules={},
+                digest=stored.digest,
+                files=stored.files,
+                bytes=stored.bytes,
+                seconds=0.1,
+                started=_STAMP,
+                finished=_STAMP,
+                run="soak",
             )
         )
     finally:

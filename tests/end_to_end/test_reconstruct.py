@@ -36,7 +36,7 @@ def test_clips_become_a_model(finished: Finished, clips: Path) -> None:
     assert (exports / "turntable.mp4").stat().st_size > 500
     assert check_store(workspace) == 4 * 2 + 6
     page = (exports / "report.html").read_text(encoding="utf-8")
-    assert "cat-00" in page and "\"ran\": [{" in page, "what ran is put into the page"
+    assert "cat-00" in page and '"ran": [{' in page, "what ran is put into the page"
 
 
 def test_the_skin_is_a_partition_of_unity(finished: Finished) -> None:
