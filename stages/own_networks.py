@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ DIGESTS = {
     "posenet-human.onnx": "d2e2a25b8e9e82b84e6d616471c5d07078b2b0560cad0e0a6e87df25ce17e866",
     "quadruped.npz": "08131d368bb1b29ac53b50747c55186bab028996b8e0a1b92598f7c03aaa02ed",
     "human.npz": "95b6eebf697fe08a808e36dd866b8130d306c1b612b96f3e7979c2fc18e4e99e",
+    "quadruped-skeleton.npz": "aabfb977e9d3dab9fc71b28930737a8da2837fa47dfe0ac5b703ca83574b950a",
+    "human-skeleton.npz": "a2f5140035bcfba243a3ac916b55fa8c415e76c00904a8233e49cd5872d2d111",
 }
 """sha256 of the files this code was written with; they are code as far as a result's key is concerned."""
 
@@ -41,9 +44,18 @@ class OwnNetwork:
 
 def canonical_surface(category: str) -> dict[str, np.ndarray]:
     """`vertices` (V, 3) and `faces` (F, 3) of the category's canonical surface, `embedding` (V, 16) of unit length."""
-    _read(f"{category}.npz")
-    with np.load(WEIGHTS / f"{category}.npz", allow_pickle=False) as file:
-        return {name: file[name] for name in ("vertices", "faces", "embedding")}
+    arrays = own_arrays(f"{category}.npz")
+    return {name: arrays[name] for name in ("vertices", "faces", "embedding")}
+
+
+def own_arrays(name: str) -> dict[str, np.ndarray]:
+    """The arrays of a file of ours, by its name with ``.npz``.
+
+    Raises:
+        WeightsDamaged: it is missing or not what it should be.
+    """
+    with np.load(io.BytesIO(_read(name)), allow_pickle=False) as file:
+        return dict(file)
 
 
 def _read(name: str) -> bytes:

@@ -28,19 +28,16 @@ def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 
     if len(points) < 10:
         return 0.0
     points = points[:: max(1, -(-len(points) // most))]
-    index = torch.arange(len(model.time), device=points.device)
-    posed = torch.cat(
-        [
-            model.forward_points(model.frames(some), points[None].expand(len(some), -1, -1)).cpu()
-            for some in index.split(64)
-        ]
-    )
+    placed, poses = [], []
+    for some in torch.arange(len(model.time), device=points.device).split(64):
+        state = model.frames(some)
+        placed.append(model.forward_points(state, points[None].expand(len(some), -1, -1)).cpu())
+        poses.append(state.camera_from_object.cpu())
+    posed, whole = torch.cat(placed), torch.cat(poses)
     free = (model.root_free[model.video_idx] > 0).cpu()
     if not free.any():
         return 0.0
     motion = rigid_parts(posed, free, softness, rounds)
-    index = torch.arange(len(model.time), device=points.device)
-    whole = torch.cat([model.frames(some).camera_from_object.cpu() for some in index.split(64)])
     settled = whole @ invert_rigid(motion)
     for i, video in enumerate(model.videos):
         mine = slice(model.starts[i], model.starts[i + 1])

@@ -234,12 +234,7 @@ def _answer(subject: Subject, k: int, best: Hypothesis, rivals: list[Hypothesis]
     every = np.arange(len(subject.cues))
     azimuth = smooth(np.interp(every, chosen, np.unwrap(azimuth)), 2.0)
     elevation = smooth(np.interp(every, chosen, elevation), 3.0)
-    half = subject.cues.half_px
-    units = half * np.interp(every, chosen, best.units[k].numpy() / half[chosen])
-    share = best.posterior[k].reshape(len(chosen), -1)
-    shift = (share @ best.offset.numpy()) * EXTENT / best.units[k].numpy()[:, None]  # of the centroid, half crops
-    offset = np.stack([np.interp(every, chosen, s) for s in (best.sequences[k].windows.centre.numpy() - shift).T], 1)
-    origin = subject.cues.centre_px + smooth(offset, 2.0) * subject.cues.half_px[:, None]
+    extent, origin_px = extent_and_origin(subject, k, best, chosen)
     margin = best.margin(k, LAST_SHARPNESS)
     agreed = agreement(best, rivals, k)
     trust = 0.95 * agreed * (1 - np.exp(-max(margin, 0.0) / TELLING_MARGIN))
@@ -248,12 +243,28 @@ def _answer(subject: Subject, k: int, best: Hypothesis, rivals: list[Hypothesis]
     return Answer(
         "search",
         view_rotation(azimuth, elevation),
-        2 * units / CROP_MARGIN,
-        origin,
+        extent,
+        origin_px,
         confidence,
         float(trust),
         figures,
     )
+
+
+def extent_and_origin(
+    subject: Subject, k: int, volume: Hypothesis, chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The object's size in the picture (T,), units, and its origin's place (T, 2), pixels, in every frame of clip `k`.
+
+    The volume knows both at the frames `chosen`.
+    """
+    every, half = np.arange(len(subject.cues)), subject.cues.half_px
+    known = volume.units[k].numpy()
+    units = half * np.interp(every, chosen, known / half[chosen])
+    share = volume.posterior[k].reshape(len(chosen), -1)
+    shift = (share @ volume.offset.numpy()) * EXTENT / known[:, None]  # of the centroid, half crops
+    offset = np.stack([np.interp(every, chosen, s) for s in (volume.sequences[k].windows.centre.numpy() - shift).T], 1)
+    return 2 * units / CROP_MARGIN, subject.cues.centre_px + smooth(offset, 2.0) * half[:, None]
 
 
 def agreement(best: Hypothesis, rivals: list[Hypothesis], k: int) -> float:

@@ -6,12 +6,10 @@ turn that the flow suggests and a smooth path are one hidden Markov model.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from stages.registration.answer import Answer, Subject, Tell, ViewBelief
-from stages.registration.placing import OBJECT_SIZE, smooth, view_rotation
+from stages.registration.placing import smooth, view_rotation
 from stages.registration.scaling import scalings
 from stages.registration.tracking import elevation_step, forward_backward, turning_posterior
 from stages.registration.turning import expected_turns
@@ -40,19 +38,23 @@ TELLING = 0.2
 
 def seen(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
     """Answers for the clips that a network has looked at, in the category's own object frame (y up, z front)."""
-    seen_, answers = [], []
+    looked, paths = [], []
     for done, subject in enumerate(subjects):
         tell(done, len(subjects), "views by network")
         if subject.view is not None and subject.rotation is None:
-            seen_.append(subject)
-            answers.append(_answer(subject, subject.view))
-    if not answers:
+            looked.append((subject, subject.view))
+            paths.append(view_path(subject, subject.view))
+    if not looked:
         return {}
-    placed = scalings(seen_, [a.rotation for a in answers], seed)
-    return {
-        s.name: replace(a, extent=p.extent, origin_px=p.origin_px)
-        for s, a, p in zip(seen_, answers, placed, strict=True)
-    }
+    rotations = [view_rotation(azimuth, elevation, roll) for azimuth, elevation, roll, _ in paths]
+    placed = scalings([subject for subject, _ in looked], rotations, seed)
+    answers = {}
+    for (subject, view), path, rotation, (extent, origin_px) in zip(looked, paths, rotations, placed, strict=True):
+        trust, agreed = _trust(subject, view, path[0])
+        confidence = trust * path[3] * np.where(subject.cues.cut, 0.5, 1.0)
+        figures = {"agreed": round(agreed, 3)}
+        answers[subject.name] = Answer("network", rotation, extent, origin_px, confidence, trust, figures)
+    return answers
 
 
 def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -93,18 +95,9 @@ def _steady(log_likelihood: np.ndarray, bins: np.ndarray) -> np.ndarray:
     return np.asarray(posterior[:, 0] @ bins)
 
 
-def _answer(subject: Subject, view: ViewBelief) -> Answer:
-    azimuth, elevation, roll, sharp = view_path(subject, view)
+def _trust(subject: Subject, view: ViewBelief, azimuth: np.ndarray) -> tuple[float, float]:
+    """How far to trust a path of azimuths (T,), and what single frames, on average, say of it."""
     away = np.angle(np.exp(1j * (view.azimuth_bins[None] - azimuth[:, None])))
     near = (np.exp(view.azimuth) * (np.abs(away) < AGREEMENT)).sum(axis=1)  # what the frame alone says of the path
     agreed = float(near[subject.cues.known].mean()) if subject.cues.known.any() else 0.0
-    trust = 1.0 - float(np.exp(-max(agreed - CHANCE, 0.0) / TELLING))
-    return Answer(
-        "network",
-        view_rotation(azimuth, elevation, roll),
-        np.full(len(subject.cues), OBJECT_SIZE),
-        subject.cues.centre_px,
-        trust * sharp * np.where(subject.cues.cut, 0.5, 1.0),
-        trust,
-        {"agreed": round(agreed, 3)},
-    )
+    return 1.0 - float(np.exp(-max(agreed - CHANCE, 0.0) / TELLING)), agreed

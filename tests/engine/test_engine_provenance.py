@@ -46,6 +46,8 @@ def test_a_quadrupeds_networks_are_found_by_what_the_stages_say() -> None:
         "flow/fox": {"provider": "dis"},
     }
     found = _brought_along(STAGES, said)
-    assert set(found) == {"posenet-quadruped.onnx", "quadruped.npz"}
+    assert set(found) == {"posenet-quadruped.onnx"}
+    followed = _brought_along(STAGES, {"posture": {"limbs": "quadruped"}})
+    assert set(followed) == {"quadruped.npz", "quadruped-skeleton.npz"}
     assert all(len(row["sha256"]) == 64 for row in found.values())
     assert "human.npz" not in _brought_along(STAGES / "retargeting", said)

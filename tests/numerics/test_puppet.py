@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
 
 from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import geodesic_angle, so3_exp
-from stages.own_networks import WeightsDamaged
+from stages.own_networks import DIGESTS, WEIGHTS, WeightsDamaged
 from stages.own_skeletons import own_puppet
 from stages.retargeting.fitting import (
     Effort,
@@ -26,16 +24,10 @@ from stages.retargeting.handing import hand_on, hang
 from stages.retargeting.puppet import Puppet, skinned, vertex_turns
 from stages.retargeting.seeing import look
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 K = torch.tensor([[300.0, 0, 128], [0, 300.0, 128], [0, 0, 1]])
 FRAMES = 8
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -222,13 +214,12 @@ def test_frames_that_show_nothing_weigh_nothing(animal: Puppet) -> None:
 
 
 def test_a_damaged_skeleton_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(own_puppet.__globals__["DIGESTS"], "human", "0" * 64)
+    monkeypatch.setitem(DIGESTS, "human-skeleton.npz", "0" * 64)
     with pytest.raises(WeightsDamaged, match="human-skeleton"):
         own_puppet("human")
 
 
 def test_the_shipped_skeletons_are_those_of_the_generator() -> None:
-    from stages.own_networks import WEIGHTS
     from synthetic.skeletons import skeleton_of
 
     for category in ("quadruped", "human"):

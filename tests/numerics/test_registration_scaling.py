@@ -21,11 +21,11 @@ def test_distance_is_steady_and_common_to_clips_that_see_other_sides() -> None:
     made = [_subject(f"c{i}", degrees, distance) for i, (degrees, distance) in enumerate(views)]
     found = scalings([m[0] for m in made], [m[1] for m in made], seed=0)
     ratios, naive = [], []
-    for (subject, _, poses), scaling in zip(made, found, strict=True):
+    for (subject, _, poses), (extent, _) in zip(made, found, strict=True):
         box = subject.cues.box_px
-        ratios.append(depth_from_size(box, subject.intrinsics, scaling.extent) / poses[:, 2, 3])
+        ratios.append(depth_from_size(box, subject.intrinsics, extent) / poses[:, 2, 3])
         naive.append(depth_from_size(box, subject.intrinsics, OBJECT_SIZE) / poses[:, 2, 3])
-        assert scaling.extent.shape == (len(poses),)
+        assert extent.shape == (len(poses),)
     spread = np.log(np.concatenate(ratios)).std()
     assert spread < 0.07 and spread < 0.5 * np.log(np.concatenate(naive)).std()
     assert ratios[2].mean() / ratios[0].mean() == pytest.approx(1, abs=0.1)
@@ -33,9 +33,9 @@ def test_distance_is_steady_and_common_to_clips_that_see_other_sides() -> None:
 
 def test_the_origin_is_one_point_of_the_body() -> None:
     subject, rotation, poses = _subject("c", np.linspace(-120, 120, 40), 3.2)
-    scaling = scalings([subject], [rotation], seed=0)[0]
+    _, origin_px = scalings([subject], [rotation], seed=0)[0]
     # where the origin would lie in object space, given true poses: the same everywhere but for a little
-    ray = np.concatenate([scaling.origin_px, np.ones((40, 1))], 1) @ np.linalg.inv(subject.intrinsics).T
+    ray = np.concatenate([origin_px, np.ones((40, 1))], 1) @ np.linalg.inv(subject.intrinsics).T
     at = np.einsum("tji,tj->ti", poses[:, :3, :3], ray * poses[:, 2, 3:] - poses[:, :3, 3])
     box_ray = np.concatenate([subject.cues.centre_px, np.ones((40, 1))], 1) @ np.linalg.inv(subject.intrinsics).T
     box_at = np.einsum("tji,tj->ti", poses[:, :3, :3], box_ray * poses[:, 2, 3:] - poses[:, :3, 3])

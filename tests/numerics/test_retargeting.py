@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -21,6 +20,8 @@ from stages.retargeting.growing import change_of_frame, grown
 from stages.retargeting.placing import directions, place_in_box, register, turn_onto
 from tests.numerics.analytic_scene import Scene, ellipsoid, intrinsics_of, model_of, scene, stir
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 RADII = torch.tensor([0.3, 0.2, 0.6])
 
 
@@ -31,14 +32,6 @@ def solid(points: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def seen() -> Scene:
     return scene(ellipsoid(RADII), frames=6)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -14,6 +13,8 @@ from stages.fitting.surface import surface_points
 from stages.fitting.trainer import Diverged, Trainer
 from stages.model.banmo import Banmo
 from tests.numerics.analytic_scene import Scene, model_of, scene, sphere, stir, tiny_settings
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = 9
 RENEW = 5
@@ -29,14 +30,6 @@ def ball(points: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def seen() -> Scene:
     return scene(sphere(0.5), frames=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def first_model(seen: Scene) -> Banmo:
