@@ -105,15 +105,16 @@
     const thead = make("thead"); thead.append(head); table.append(thead, body);
     $("plan").replaceChildren(make("p", "about", `${ran.length} results, ${seconds(total)} of work in all; what was up to date was not done again.`), table);
   }
+  const stagesOf = (results) => [...new Set(results.map((r) => r.split("/")[0]))].join(", ");
   const licensed = provenance ? [
-    ...Object.entries(provenance.networks || {}).map(([name, n]) => [name, n.summary, n.licence, n.source, (n.used_by || []).join(", ")]),
+    ...Object.entries(provenance.networks || {}).map(([name, n]) => [name, n.summary, n.licence, n.source, stagesOf(n.used_by || [])]),
     ...Object.entries(provenance.files_of_settings || {}).filter(([, f]) => f.about && f.about.licence).map(([name, f]) => [name, f.about.summary || "", f.about.licence, f.about.source || f.about.url || "", name.split(".")[0]]),
   ] : [];
   if (licensed.length) {
     const table = make("table"), head = make("tr");
     for (const t of ["File", "What it is", "Licence", "Source", "Used by"]) head.append(make("th", "", t));
     table.append(head);
-    for (const cells of licensed) { const row = make("tr"); for (const c of cells) row.append(make("td", "", String(c || ""))); table.append(row); }
+    for (const cells of licensed) { const row = make("tr"); for (const c of cells) row.append(make("td", "whole", String(c || ""))); table.append(row); }
     $("networks-table").append(table); $("networks").hidden = false;
   }
   if (provenance && provenance.settings) {
