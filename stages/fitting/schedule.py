@@ -107,8 +107,9 @@ class PhaseSettings:
     """Share of the phase from which skinning is corrected by a network; above 1 = never."""
     renew_at: float = 2.0
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
-    mend: bool = False
-    """Whenever bounds are updated, tie parts of the shape that came loose to the body, and remove specks."""
+    mend: bool = True
+    """Whenever bounds are updated, tie parts of the shape that came loose to the body, and remove what the masks do not
+    vouch for: specks, and sheets that float where no ray is drawn."""
     mend_from: float = 0.3
     """Share of the phase from which that is done; before, limbs may still grow together."""
     reject_at: float = 2.0

@@ -16,6 +16,7 @@ from stages.fitting.active import Uncertainty, most_uncertain
 from stages.fitting.batches import Batch, draw, step_generator
 from stages.fitting.connect import mend
 from stages.fitting.diagnose import FrameFigures, frame_figures, misfits, replace_from_neighbours
+from stages.fitting.evidence import share_on_masks
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
 from stages.fitting.renew import renew_bones, renew_bounds
@@ -102,11 +103,14 @@ class Trainer:
     def refresh(self) -> None:
         """Extract the surface anew and each frame's box around it: near and far planes, matching bounds."""
         if self.settings.mend and self.settings.lr_sdf > 0 and self.progress >= self.settings.mend_from:
-            mend(self.model)
+            mend(self.model, self._seen)
         points = self.team.agree(surface_points(self.model).to(self.device))
         if len(points) >= 100:
             self.model.surface = points
         self.boxes = self.team.agree(frame_boxes(self.model))
+
+    def _seen(self, points: Tensor) -> Tensor:
+        return share_on_masks(self.model, self.observations, points.to(self.device))
 
     def step(self) -> dict[str, float]:
         """One step of descent; returns the weighted value of each term.
