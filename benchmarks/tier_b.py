@@ -19,8 +19,9 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.trials import judge, observe, presets, reconstruct, shaken, write_meshes
+from benchmarks.trials import Seen, judge, observe, presets, reconstruct, shaken, write_meshes
 from stages.geometry.rotations import so3_log
+from stages.registration.steadying import steady
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +37,14 @@ def rotation_error_deg(found: Tensor, truth: Tensor) -> tuple[float, float]:
     rest = (found.double() @ (u @ flip @ vt)).transpose(1, 2) @ truth.double()
     angle = so3_log(rest).norm(dim=-1).rad2deg()
     return float(angle.mean()), float(angle.std())
+
+
+def steadied(seen: Seen) -> Tensor:
+    """Root poses (T, 4, 4) without their jitter, clip by clip."""
+    lengths = [len(video.time_s) for video in seen.videos]
+    tracks = [track.double().numpy() for track in seen.poses.split(lengths)]
+    made, _, _ = steady(tracks, [np.array(video.time_s) for video in seen.videos])
+    return torch.from_numpy(np.concatenate(made)).float()
 
 
 def main(
@@ -61,6 +70,8 @@ def main(
     for angle in (0.0, *degrees):
         wrong = replace(seen, poses=shaken(seen.poses, angle, seed))
         before = rotation_error_deg(wrong.poses[:, :3, :3], seen.poses[:, :3, :3])
+        if angle:  # as the poses stage does with poses.refine = true
+            wrong = replace(wrong, poses=steadied(wrong))
         model, seconds = reconstruct(wrong, *settings, hold_roots=angle == 0)
         with torch.no_grad():
             after = rotation_error_deg(

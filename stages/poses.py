@@ -30,6 +30,7 @@ from stages.registration.placing import (
 from stages.registration.search import search
 from stages.registration.seen import seen
 from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
+from stages.registration.steadying import steady
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
@@ -59,7 +60,7 @@ class PosesSettings:
     focal_px: float = 0.0
     """Focal length in pixels of the kept frames; 0 takes the file's own hint, or else the longer side."""
     refine: bool = False
-    """Let the optimiser move root poses that were given; otherwise they are held fixed."""
+    """Let the optimiser move root poses that were given, after their jitter is taken out; otherwise they are held."""
     seed: int = 0
     """Seed of the search."""
 
@@ -82,6 +83,8 @@ def poses(
     clips = {name: formats.read_clip(folder.path) for name, folder in frames.items()}
     documents = {name: path for name, g in given.items() if (path := g.get(GIVEN)) is not None}
     tracks = {name: read_given(documents[name], clips[name]) for name in clips if name in documents}
+    if settings.refine:
+        tracks = _steadied(tracks, clips, run)
     asked = [name for name in clips if name not in tracks]
     if asked and settings.provider == "given":
         raise BadInput(
@@ -129,6 +132,23 @@ def read_given(path: Path, clip: formats.Clip) -> formats.PoseTrack:
     return formats.PoseTrack(
         scale_intrinsics(intrinsics, scale_x, scale_y), kept, np.ones(len(kept)), ["given"] * len(kept)
     )
+
+
+def _steadied(
+    tracks: dict[str, formats.PoseTrack], clips: dict[str, formats.Clip], run: Run
+) -> dict[str, formats.PoseTrack]:
+    """Given poses that the optimiser may move begin without their jitter: it moves them smoothly."""
+    if not tracks:
+        return tracks
+    matrices, turned_s, placed_s = steady(
+        [track.object_to_camera for track in tracks.values()], [clips[name].time_s for name in tracks]
+    )
+    run.metric("steadied_turns_s", turned_s)
+    run.metric("steadied_places_s", placed_s)
+    return {
+        name: replace(track, object_to_camera=made)
+        for (name, track), made in zip(tracks.items(), matrices, strict=True)
+    }
 
 
 def _embedding_basis(features: dict[str, Folder]) -> np.ndarray | None:

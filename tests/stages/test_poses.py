@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline import BadInput, Folder, Given, Run
 from stages import poses as stage_module
@@ -105,6 +106,27 @@ def test_given_poses_are_used_as_they_are(tmp_path: Path, clips: dict[str, np.nd
     assert summary["trust"] == 1.0 and summary["won"] == {"a": "given", "b": "given"}
     assert summary["videos"]["b"]["fixed"] is True
     assert run.warnings == [] and summary["advice"] == ""
+
+
+def test_given_poses_that_may_move_lose_their_jitter(tmp_path: Path) -> None:
+    truth = write_clip(tmp_path, "a", np.linspace(0, 1.5, 24))
+    rng = np.random.default_rng(0)
+    wrong = truth.copy()
+    wrong[:, :3, :3] = truth[:, :3, :3] @ Rotation.from_rotvec(0.2 * rng.normal(size=(24, 3))).as_matrix()
+    given = {"a": save(tmp_path, "a", document(wrong))}
+
+    def error(found: np.ndarray) -> float:
+        rest = truth[:, :3, :3].transpose(0, 2, 1) @ found[:, :3, :3]
+        return float(Rotation.from_matrix(rest).magnitude().mean())
+
+    for moves in (False, True):
+        out, run = run_poses(tmp_path, given, refine=moves)
+        found = read_poses(out / "a.json").object_to_camera
+        if moves:
+            assert error(found) < 0.5 * error(wrong) and run.metrics["steadied_turns_s"] > 0
+        else:
+            assert np.allclose(found, wrong, atol=1e-6) and "steadied_turns_s" not in run.metrics
+        out.rename(tmp_path / f"moves-{moves}")
 
 
 @pytest.mark.parametrize(
