@@ -32,7 +32,7 @@ from stages.formats import (
     write_mask_facts,
 )
 from stages.networks import NO_FILE, PromptedMaskNetwork, mask_network
-from stages.own_networks import CATEGORIES, OwnNetwork
+from stages.own_networks import CATEGORIES, OwnNetwork, OwnRefiner
 from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.prior import object_prior
@@ -53,6 +53,8 @@ class MaskSettings:
     """Probability above which a pixel counts as the object, for boxes, areas and flags."""
     category: str = "auto"
     """quadruped or human: a network of ours that knows it helps; other: none does; auto: whichever fits what moves."""
+    refinements: int = 1
+    """How often a network of ours goes over the rough mask of a quadruped or a person; 0 leaves it rough."""
     seed: int = 0
     """Seed of the built-in segmentation."""
     network: InputFile = NO_FILE
@@ -77,11 +79,13 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        effort = Effort(seed=settings.seed)
+        effort = Effort(refinements=settings.refinements, seed=settings.seed)
         images = clip.images()
         priors = _priors(images, settings.category, run)
-        result = segment(images, hints, effort, tick=_ticker(run), priors=priors)
+        refiner = OwnRefiner(device=run.device, threads=run.threads)
+        result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner)
         run.metric("category_prior", result.prior or "none")
+        run.metric("refined_by", refiner.name if result.refined else "none")
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
     facts = _facts(provider, result, clip, settings.threshold)

@@ -60,7 +60,7 @@ _POSTURES: dict[str, Callable[[np.random.Generator], Posture]] = {
 
 @dataclass(frozen=True)
 class Shard:
-    """N renderings of one category, S = SIDE_PX."""
+    """N renderings of one category, S x S pixels."""
 
     vertex: np.ndarray  # (N, S, S) uint16 canonical vertex, NOTHING off the object
     part: np.ndarray  # (N, S, S) uint8 index into PARTS[category]
@@ -110,9 +110,11 @@ def vertex_parts(body: Body, category: str, rng: np.random.Generator) -> np.ndar
     return _person_parts(body, rng) if category == "human" else _quadruped_parts(body, rng)
 
 
-def render_views(body: Body, category: str, labels: np.ndarray, views: int, rng: np.random.Generator) -> Shard:
+def render_views(
+    body: Body, category: str, labels: np.ndarray, views: int, rng: np.random.Generator, side_px: int = SIDE_PX
+) -> Shard:
     """Pictures of one body in `views` postures from `views` sides; `labels` (V,) canonical vertex of each vertex."""
-    shape = (views, SIDE_PX, SIDE_PX)
+    shape = (views, side_px, side_px)
     shard = Shard(
         np.full(shape, NOTHING, np.uint16), np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.int8),
         np.zeros((views, 3, 3), np.float32), np.zeros((views, 3), np.float32),
@@ -126,10 +128,10 @@ def render_views(body: Body, category: str, labels: np.ndarray, views: int, rng:
         seen = posed @ rotation.T + np.array([0, 0, np.exp(rng.uniform(np.log(2.2), np.log(8.0)))])
         flat = seen[:, :2] / seen[:, 2:]
         low, high = flat.min(0), flat.max(0)
-        focal = SIDE_PX / (float((high - low).max()) * BOX_MARGIN)
-        centre = SIDE_PX / 2 - focal * (low + high) / 2
+        focal = side_px / (float((high - low).max()) * BOX_MARGIN)
+        centre = side_px / 2 - focal * (low + high) / 2
         intrinsics = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
-        fragments = rasterise(seen, body.faces, intrinsics, SIDE_PX, SIDE_PX)
+        fragments = rasterise(seen, body.faces, intrinsics, side_px, side_px)
         pixels = fragments.pixels()
         weight = fragments.barycentric.reshape(-1, 3)[pixels]
         corners = body.faces[fragments.face_idx.reshape(-1)[pixels]]
@@ -239,6 +241,7 @@ def main(
     views: int = 100,
     seed: int = 0,
     first: int = 0,
+    side_px: int = SIDE_PX,
 ) -> None:
     """Render a bank; one file a body.
 
@@ -249,6 +252,7 @@ def main(
         views: Pictures a body.
         seed: Another seed, another bank.
         first: Number of the first body, to go on with a bank begun before.
+        side_px: Side of a picture; networks of poses take the default, the one that refines masks twice that.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     out.mkdir(parents=True, exist_ok=True)
@@ -258,7 +262,7 @@ def main(
         rng = np.random.default_rng([seed, len(category), k])
         part = out / f".{category}-{k:04d}.part"
         body = random_body(rng, category)
-        render_views(body, category, label(body), views, rng).save(part)
+        render_views(body, category, label(body), views, rng, side_px).save(part)
         part.rename(out / f"{category}-{k:04d}.npz")
     spent = time.perf_counter() - begun
     log.info("%d pictures in %.0f s, %.0f a second", bodies * views, spent, bodies * views / spent)

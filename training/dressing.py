@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from training.network import INPUT_PX
 from training.wardrobe import Bank, Random, coloured
 
-LABEL_PX = INPUT_PX // 4
+LABEL_SHARE = 4
+"""Pixels of a picture to one label."""
 
 
 @dataclass
 class Batch:
-    """What one training step sees of one category. S = INPUT_PX, L = LABEL_PX."""
+    """What one training step sees of one category. S = side of the bank's pictures, L = S / 4."""
 
     image: Tensor  # (B, 3, S, S) sRGB 0..1
     mask: Tensor  # (B, 1, S, S) coverage
@@ -76,7 +76,8 @@ def _pictured(
     draw: Random,
     hard: float,
 ) -> Batch:
-    count, side = len(rgba), INPUT_PX
+    count, side = len(rgba), rgba.shape[-1]
+    few = side // LABEL_SHARE
     flip = 1.0 - 2.0 * draw.chance(count, 0.5).float()
     wide = draw.chance(count, 0.2)
     scale = torch.where(wide, draw.uniform(count, low=1.4, high=2.2), draw.uniform(count, low=0.98, high=1.45))
@@ -91,14 +92,14 @@ def _pictured(
     instead = (~present & draw.chance(count, 0.75))[:, None, None, None]
     seen = functional.grid_sample(torch.where(instead, lumps, rgba), grid, align_corners=False)
     seen = seen * (present[:, None, None, None] | instead)
-    coarse = _grid(scale, shift, flip, LABEL_PX, stretch)
+    coarse = _grid(scale, shift, flip, few, stretch)
     nothing = len(bank.rest)
     numbers = functional.grid_sample((vertex - nothing).float()[:, None], coarse, mode="nearest", align_corners=False)
     label = numbers[:, 0].long() + nothing
     swapped = torch.cat([bank.mirror, torch.tensor([nothing])])[label]
     label = torch.where(flip[:, None, None] < 0, swapped, label)
 
-    back = _behind(backgrounds, count, draw)
+    back = _behind(backgrounds, count, side, draw)
     stranger = draw.chance(count, 0.45 * hard)[:, None, None, None]
     place = draw.uniform(count, 2, low=-1.6, high=1.6)
     another = functional.grid_sample(
@@ -112,20 +113,20 @@ def _pictured(
     image, alpha = _occlude(image, alpha, backgrounds, draw, hard)
     shown = (alpha > 0.5).float()
     mask = shown * present[:, None, None, None]
-    hidden = functional.interpolate(alpha, (LABEL_PX, LABEL_PX), mode="area")[:, 0] < 0.5
+    hidden = functional.interpolate(alpha, (few, few), mode="area")[:, 0] < 0.5
     label = torch.where(hidden | (label >= nothing) | ~present[:, None, None], -1, label)
     angles = torch.stack([view[:, 0] * flip, view[:, 1], view[:, 2] * flip], 1)
     visible = mask.mean((1, 2, 3)) > 0.015
     return Batch(_camera(image, draw, hard), mask, label, angles, present & visible, shown)
 
 
-def _behind(backgrounds: Tensor, count: int, draw: Random) -> Tensor:
+def _behind(backgrounds: Tensor, count: int, side: int, draw: Random) -> Tensor:
     """(B, 3, S, S) windows into random backgrounds, their colours changed."""
     chosen = backgrounds[draw.below(len(backgrounds), count)].float() / 255
     scale = draw.uniform(count, low=0.45, high=1.0)
     flip = 1.0 - 2.0 * draw.chance(count, 0.5).float()
     shift = (1 - scale)[:, None] * draw.uniform(count, 2, low=-1, high=1)
-    image = functional.grid_sample(chosen, _grid(scale, shift, flip, INPUT_PX), align_corners=False)
+    image = functional.grid_sample(chosen, _grid(scale, shift, flip, side), align_corners=False)
     return (image * draw.uniform(count, 3, 1, 1, low=0.75, high=1.25) * draw.uniform(count, 1, 1, 1, low=0.7)).clamp(
         0, 1
     )
@@ -146,7 +147,7 @@ def _shadow(alpha: Tensor, draw: Random) -> Tensor:
 
 def _occlude(image: Tensor, alpha: Tensor, backgrounds: Tensor, draw: Random, hard: float) -> tuple[Tensor, Tensor]:
     """Something stands in front: a box or a bar that shows another background."""
-    count, side = len(image), INPUT_PX
+    count, side = len(image), image.shape[-1]
     some = int(count * 0.15 * hard)
     if not some:
         return image, alpha
@@ -155,14 +156,14 @@ def _occlude(image: Tensor, alpha: Tensor, backgrounds: Tensor, draw: Random, ha
     half[:, 1:] = torch.where(draw.chance(some, 0.3)[:, None, None, None], float(side), half[:, 1:])
     y, x = torch.arange(side)[:, None] + 0.5, torch.arange(side)[None] + 0.5
     box = (((x - centre[:, 0]).abs() < half[:, 0]) & ((y - centre[:, 1]).abs() < half[:, 1])).float()[:, None]
-    front = _behind(backgrounds, some, draw)
+    front = _behind(backgrounds, some, side, draw)
     image = torch.cat([image[:some] * (1 - box) + front * box, image[some:]])
     return image, torch.cat([alpha[:some] * (1 - box), alpha[some:]])
 
 
 def _camera(image: Tensor, draw: Random, hard: float) -> Tensor:
     """Blur, low resolution, exposure, colour temperature, contrast, noise."""
-    count, side = len(image), INPUT_PX
+    count, side = len(image), image.shape[-1]
 
     def where(chance: float) -> Tensor:
         return draw.chance(count, chance)[:, None, None, None]

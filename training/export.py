@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from synthetic.canonical import canonical_body
 from training.losses import Surface
 from training.network import CATEGORIES, EMBEDDING, INPUT_PX, VIEW_OUTPUTS, Network
+from training.refine import Refiner, averaged_refiner
 from training.train import make_surface, read_state
 
 log = logging.getLogger(__name__)
@@ -181,6 +182,15 @@ def posenet_model(network: Network, category: int, provenance: dict[str, str]) -
     return _finish(g, [image], outputs, f"posenet-{CATEGORIES[category]}", provenance)
 
 
+def refiner_model(refiner: Refiner, provenance: dict[str, str]) -> onnx.ModelProto:
+    """Picture and rough mask N x 4 x H x W -> `logit` N x 1 x H x W."""
+    g = _Graph()
+    image = helper.make_tensor_value_info("input", TensorProto.FLOAT, ["n", 4, "h", "w"])
+    fine = _trunk(g, refiner.trunk, _halve(g, "input"))["fine2"]
+    logit = g.op("DepthToSpace", g.convolve(fine, refiner.head), blocksize=2, mode="CRD")
+    return _finish(g, [image], {"logit": (logit, ["n", 1, "h", "w"])}, "refine", provenance)
+
+
 def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]:
     """Write all files; returns their sha256 by name."""
     saved = read_state(state)
@@ -224,20 +234,28 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
     """Write trained networks as ONNX files.
 
     Args:
-        state: The `state.safetensors` of a training run; its `log.jsonl` lies beside it.
+        state: The `state.safetensors` of a training run (`log.jsonl` beside it), or the `refine.safetensors` of a
+            refiner's (`refine.jsonl` beside it).
         out: Folder to write to.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    lines = (state.parent / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    refining = state.stem == "refine"
+    lines = (state.parent / ("refine.jsonl" if refining else "log.jsonl")).read_text(encoding="utf-8").splitlines()
     last = json.loads(lines[-1])
     provenance = {
-        "made_by": "python -m training.train, python -m training.export",
+        "made_by": f"python -m training.{'refine' if refining else 'train'}, python -m training.export",
         "trained_on": "renderings of generated bodies only (synthetic/)",
         "pictures": str(last["pictures"]),
         "steps": str(last["step"]),
         "licence": "Apache-2.0",
     }
-    for name, digest in export(state, out, provenance).items():
+    if refining:
+        out.mkdir(parents=True, exist_ok=True)
+        model = refiner_model(averaged_refiner(state), provenance)
+        written = {"refine.onnx": _write(out / "refine.onnx", model.SerializeToString(deterministic=True))}
+    else:
+        written = export(state, out, provenance)
+    for name, digest in written.items():
         log.info("%s  %s", digest, name)
 
 

@@ -79,13 +79,7 @@ class Network(nn.Module):
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         """mask (N, 2, H/2, W/2) logits; fine (N, 64, H/4, W/4) for `embed`; coarse for `look`; category (N, 3)."""
-        at2 = self.stem(nn.functional.pixel_unshuffle(x, 2))
-        at4 = self.at4(self.down4(at2))
-        at8 = self.at8(self.down8(at4))
-        at16 = self.at16(self.down16(at8))
-        fine8 = self.join8(self.up8(at16) + self.side8(at8))
-        fine4 = self.join4(self.up4(fine8) + self.side4(at4))
-        fine2 = self.join2(self.up2(fine4) + self.side2(at2))
+        fine2, fine4, at16 = self._levels(x)
         pooled = nn.functional.avg_pool2d(fine4, 4)
         return {
             "mask": self.mask(fine2),
@@ -93,6 +87,20 @@ class Network(nn.Module):
             "coarse": torch.cat([at16, pooled], 1),
             "category": self.category(at16.mean((2, 3))),
         }
+
+    def features(self, x: Tensor) -> Tensor:
+        """(N, 32, H/2, W/2) finest features alone."""
+        return self._levels(x)[0]
+
+    def _levels(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Features at a half and a quarter of the size on the way up, and at a sixteenth."""
+        at2 = self.stem(nn.functional.pixel_unshuffle(x, 2))
+        at4 = self.at4(self.down4(at2))
+        at8 = self.at8(self.down8(at4))
+        at16 = self.at16(self.down16(at8))
+        fine8 = self.join8(self.up8(at16) + self.side8(at8))
+        fine4 = self.join4(self.up4(fine8) + self.side4(at4))
+        return self.join2(self.up2(fine4) + self.side2(at2)), fine4, at16
 
     def embed(self, fine: Tensor, category_idx: int) -> Tensor:
         """(N, 16, H/4, W/4) embedding of a category, unit length."""

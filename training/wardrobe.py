@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from synthetic.bank import NOTHING, PARTS, SIDE_PX, Shard
+from synthetic.bank import NOTHING, PARTS, Shard
 
 
 @dataclass
@@ -82,7 +82,7 @@ def coloured(bank: Bank, count: int, draw: Random) -> tuple[Tensor, Tensor, Tens
     normal = bank.normal[chosen].reshape(count, -1, 3).float() / 127
     colour = (colour.clamp(0.02, 0.98) * _light(normal, draw)).clamp(0, 1)
     mask = on.reshape(count, -1, 1).float()
-    rgba = torch.cat([colour * mask, mask], 2).transpose(1, 2).reshape(count, 4, SIDE_PX, SIDE_PX)
+    rgba = torch.cat([colour * mask, mask], 2).transpose(1, 2).reshape(count, 4, *vertex.shape[1:])
     return rgba, vertex, bank.view[chosen]
 
 

@@ -4,7 +4,8 @@
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
 3. The same again on plain colours, leaving the uncertain rim of the mask out of the fit: this tightens the outline.
-4. Flicker is voted away along the flow, and the outline is settled at full resolution.
+4. A network that has learnt to mend rough masks (`refining`) does so at the pictures' own size.
+5. Flicker is voted away along the flow, and the outline is settled at full resolution.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from stages.perception.appearance import PixelColours, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
+from stages.perception.refining import RefiningNetwork, refine
 from stages.perception.temporal import flow_median, main_component
 
 WORK_SIDE_PX = 256
@@ -49,6 +51,7 @@ class Segmentation:
     probability: np.ndarray
     agreement: np.ndarray
     prior: str = ""  # the category whose network had a say
+    refined: bool = False  # whether a network went over the rough mask
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Effort:
     """How much work the built-in segmentation does."""
 
     rounds: int = 2
+    refinements: int = 1
     seed: int = 0
 
 
@@ -94,10 +98,12 @@ def segment(
     effort: Effort | None = None,
     tick: Tick = lambda done, total, label: None,
     priors: dict[str, np.ndarray] | None = None,
+    refiner: RefiningNetwork | None = None,
 ) -> Segmentation:
     """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB.
 
     `priors` are category networks' ideas of it, (T, H, W) uint8 each; the one that fits what moves has a say.
+    `refiner` makes the rough mask of such an object exact.
     """
     effort = effort or Effort()
     work = [shrink(image, WORK_SIDE_PX) for image in images]
@@ -108,13 +114,19 @@ def segment(
         told = carrier.spread(told, 0.93, strongest=False)
     chosen = choose_prior(priors or {}, cues)
     if chosen:
-        told = told + prior_evidence((priors or {})[chosen], work[0].shape[:2])
-    soft = coarse_probability(work, cues, told, carrier, effort)
-    tick(1, 2, "learning")
-    soft = tight_probability(work, soft, cues, told, effort)
-    tick(2, 2, "learning")
+        known = told + prior_evidence((priors or {})[chosen], work[0].shape[:2])
+    else:
+        known = told
+    soft = coarse_probability(work, cues, known, carrier, effort)
+    tick(1, 3, "learning")
+    soft = tight_probability(work, soft, cues, known, effort)
+    tick(2, 3, "learning")
+    refined = refiner is not None and bool(chosen) and effort.refinements > 0
+    if refiner is not None and refined:
+        soft = refined_probability(images, soft, told, refiner, effort)
+    tick(3, 3, "learning")
     found = finish(images, soft, carrier)
-    return Segmentation(found.probability, found.agreement, chosen)
+    return Segmentation(found.probability, found.agreement, chosen, refined)
 
 
 # --------------------------------------------------------------------------------------------- the steps
@@ -184,6 +196,21 @@ def tight_probability(
         logit = looks + place + 0.5 * np.clip(cues.evidence, -1, 3) + told
         found = np.where(off, 0.002, _sigmoid(logit)).astype(np.float32)
         found = np.stack([main_component(f > 0.5, f) * f for f in found])
+    return found
+
+
+def refined_probability(
+    images: np.ndarray, soft: np.ndarray, told: np.ndarray, refiner: RefiningNetwork, effort: Effort
+) -> np.ndarray:
+    """(T, H, W) probability at the images' own size: the rough one mended, several times over; hints still count."""
+    height, width = images.shape[1:3]
+    found = _resized(soft, width, height)
+    hinted = told.any()
+    for _ in range(effort.refinements):
+        found = refine(images, found, refiner)
+        if hinted:
+            logit = np.log((found + 0.01) / (1.01 - found))
+            found = np.stack([_sigmoid(a + cv2.resize(b, (width, height))) for a, b in zip(logit, told, strict=True)])
     return found
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnxruntime
 import pytest
 
 from stages import own_networks
-from stages.own_networks import CATEGORIES, WEIGHTS, OwnNetwork, WeightsDamaged, canonical_surface
+from stages.own_networks import CATEGORIES, WEIGHTS, OwnNetwork, OwnRefiner, WeightsDamaged, canonical_surface
 from stages.perception.category import choose_category
 from stages.perception.prior import object_prior
+from stages.perception.refining import refine
 from stages.perception.viewpoint import AZIMUTH_DEG, angle_log_probabilities
 from stages.registration.placing import ray_rotation, view_angles
 from synthetic.clips import Film, film, make_subject
-from tests.stages.perception_clips import moving_clip
+from tests.stages.perception_clips import moving_clip, overlap
 
 SEEN_AS = {"dog": "quadruped", "person": "human"}
 
@@ -53,6 +55,18 @@ def test_a_vertex_is_nearest_to_itself(category: str) -> None:
     alike = (embedding * embedding[image]).sum(1)[aside]
     neighbour = (embedding[surface["faces"][:, 0]] * embedding[surface["faces"][:, 1]]).sum(1)
     assert alike.mean() < 0.9 * neighbour.mean()
+
+
+def test_the_refiner_mends_what_a_rough_mask_lost(clip: Film) -> None:
+    assert (WEIGHTS / OwnRefiner.name).stat().st_size <= 8_000_000
+    truth = clip.masks > 0.5
+    rough = clip.masks.astype(np.float32).copy()
+    for t, mask in enumerate(truth):
+        rows = np.nonzero(mask.any(1))[0]
+        rough[t, rows[-1] - (rows[-1] - rows[0]) // 8 :] = 0  # feet gone
+        rough[t] = cv2.GaussianBlur(rough[t], (0, 0), 2.0)  # outline vague
+    found = refine(clip.images, rough, OwnRefiner())
+    assert overlap(found > 0.5, truth) > overlap(rough > 0.5, truth) + 0.03
 
 
 def test_damaged_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
