@@ -185,6 +185,8 @@ def log_command(args: argparse.Namespace, options: Options) -> int:
             sys.stdout.write(f"==> {path}\n")
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
         sys.stdout.writelines(lines[-args.lines :] if args.lines > 0 else lines)
+        if not lines and not args.follow:
+            sys.stdout.write(f"it had nothing to say ({path})\n")
     if args.follow:
         _follow(paths[-1])
     return ExitCode.DONE

@@ -109,6 +109,7 @@ def test_a_failure_keeps_the_others_and_tells_where_to_look(lab: Lab) -> None:
     assert set(lab.records()) == {"words/dog", "upper/dog", "measure/dog"}
     log = lab.command("log", "words", "cat").out
     assert "Traceback" in log and "garbage on standard output" in log
+    assert "it had nothing to say" in lab.command("log", "upper", "dog").out
     status = lab.command("status").out
     assert "words/cat failed: RuntimeError" in status
     assert not (lab.workspace / "exports").exists()
