@@ -101,10 +101,10 @@ class Rig:
 class PosedClip:
     """The rig in one video, at T times.
 
-    vertices: (T, V, 3) float32 by the model's own warp, object space. joints: (T, B, 4, 4) object_from_joint.
-    camera_from_object: (T, 4, 4). intrinsics: (3, 3). skinning_error: influences kept -> the largest distance between
-    the model's warp and linear blend skinning with so many influences, over vertices and frames, in units of the
-    object's length.
+    vertices: (T, V, 3) float32 as the rig poses them, object space: what every file shows. joints: (T, B, 4, 4)
+    object_from_joint. camera_from_object: (T, 4, 4). intrinsics: (3, 3). skinning_error: influences kept -> the
+    largest distance between the model's warp and linear blend skinning with so many influences, over vertices and
+    frames, in units of the object's length.
     """
 
     vertices: np.ndarray
@@ -174,14 +174,11 @@ def _posed_clip(
     model: Animatable, rig: Rig, video_idx: int, time_s: np.ndarray, vertices: np.ndarray, transforms: np.ndarray
 ) -> PosedClip:
     error = {}
-    for influences, (index, weight) in rig.skins.items():
-        worst = [
-            np.linalg.norm(blend(rig.mesh.vertices, transforms[t : t + 1], index, weight) - vertices[t], axis=-1).max()
-            for t in range(len(time_s))
-        ]
-        error[influences] = float(max(worst)) / max(rig.mesh.length, 1e-12)
+    for influences in sorted(rig.skins):  # the most exact comes last, and stays
+        skinned = blend(rig.mesh.vertices, transforms, *rig.skins[influences])
+        error[influences] = float(np.linalg.norm(skinned - vertices, axis=-1).max()) / max(rig.mesh.length, 1e-12)
     return PosedClip(
-        vertices,
+        skinned.astype(np.float32),
         rig.skeleton.posed(transforms),
         nearest_rigid(model.root_poses(video_idx, _seconds(time_s)).cpu().numpy()),
         model.intrinsics(video_idx).cpu().numpy().astype(np.float64),

@@ -217,7 +217,8 @@ def test_every_source_frame_has_a_mesh_in_object_space(result: tuple[Result, Pat
         posed = made.model.forward_warp(torch.from_numpy(np.array(rest.vertices)).float(), k, time_s).numpy()
         for i in (0, 2, 5):  # frame 2 was dropped by the frames stage, its mesh is there all the same
             mesh = trimesh.load(files[i], process=False)
-            np.testing.assert_allclose(mesh.vertices, posed[i], atol=1e-5)
+            # The meshes are the rig's, which follows the model as closely as a few influences a vertex can.
+            np.testing.assert_allclose(mesh.vertices, posed[i], atol=1e-3 * float(np.ptp(posed[i], axis=0).max()))
             np.testing.assert_array_equal(mesh.faces, rest.faces)
             expected = made.model.colour(torch.from_numpy(np.array(rest.vertices)).float(), k).numpy()
             assert np.abs(mesh.visual.vertex_colors[:, :3] / 255 - expected).max() < 0.01
