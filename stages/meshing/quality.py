@@ -213,7 +213,7 @@ def judge(
         where = f", mostly its {side} side: add a clip from there" if side else ": add clips from other sides"
         advice.append(f"{unseen:.0%} of the surface was never seen{where}.")
     worst = max((c.skinning_error_8 for c in clips), default=0.0)
-    if worst > 1e-3:
+    if worst > 5e-3:
         advice.append(f"The rig in model.glb follows the model only to {worst:.1%} of the object's length.")
     if dropped_area > 0.05:
         advice.append(f"Loose pieces ({dropped_area:.0%} of the surface) were left out of the mesh.")
