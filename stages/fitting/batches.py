@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ class Batch(NamedTuple):
     flow: Tensor  # (F, P, 2) pixels, to the partner frame
     flow_confidence: Tensor  # (F, P) in 0..1; zero where there is none
     features: Tensor | None  # (F, P, 16) unit length, or zero off the object
+    beside: Tensor  # (F, h, w) float32: pixels of the frame from each cell of a small picture to the mask
+    beside_scale: Tensor  # (F, 1): cells of that picture a pixel of the frame
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
@@ -116,7 +119,16 @@ def look(
         flow=flow,
         flow_confidence=confidence,
         features=_features(observations, chosen, xy),
+        beside=_beside(observations, chosen),
+        beside_scale=observations.silhouette_scale[chosen][:, None],
     )
+
+
+def _beside(observations: Observations, chosen: Tensor) -> Tensor:
+    """(F, h, w) distance in pixels of the frame from the object's mask, on the small silhouettes; zero on it."""
+    off = (observations.silhouettes[chosen] <= 127).numpy().astype(np.uint8)
+    cells = np.stack([cv2.distanceTransform(map_, cv2.DIST_L2, 3) for map_ in off])
+    return torch.from_numpy(cells) / observations.silhouette_scale[chosen][:, None, None]
 
 
 def _features(observations: Observations, frame_idx: Tensor, pixels: Tensor) -> Tensor | None:

@@ -18,7 +18,7 @@ from stages.model.banmo import Banmo, FrameState
 from stages.model.correspondence import match_grid, soft_argmax
 from stages.model.fields import GridField
 
-_PICTURE_TERMS = ("silhouette", "rgb", "cover", "feature", "match", "cycle_2d")
+_PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
 
 
 class Rendered(NamedTuple):
@@ -154,6 +154,8 @@ def evaluate(
     if settings.weight_cover and step >= settings.cover_from * settings.iterations and len(model.surface):
         uncovered = inside * (opacity < 0.3)
         add("cover", settings.weight_cover, _cover(model, state, batch, uncovered, generator))
+    if settings.weight_spill and step >= settings.spill_from * settings.iterations and len(model.surface):
+        add("spill", settings.weight_spill, _spill(model, state, batch, generator))
     if batch.features is not None:
         terms.update(_correspondence(model, state, batch, seen, inside * opacity, settings, step, draws))
     if settings.weight_cycle_3d:
@@ -168,13 +170,28 @@ def evaluate(
     return terms
 
 
+def _placed(model: Banmo, state: FrameState, frames: int, generator: torch.Generator) -> Tensor:
+    """Pixels (F, N, 2) of random points of the surface as posed in each frame."""
+    pick = torch.randint(len(model.surface), (400,), generator=generator).to(model.surface.device)
+    points = model.surface[pick][None].expand(frames, -1, -1)
+    return project(state.intrinsics, transform(state.camera_from_object, model.forward_points(state, points)))
+
+
+def _farthest_px(model: Banmo) -> float:
+    """Beyond that distance nothing is pulled."""
+    return 0.15 * max(max(v.width, v.height) for v in model.videos)
+
+
 def _cover(model: Banmo, state: FrameState, batch: Batch, uncovered: Tensor, generator: torch.Generator) -> Tensor:
     """What pulls lagging limbs: rendering has no gradient where nothing is drawn near a pixel of the object."""
-    pick = torch.randint(len(model.surface), (400,), generator=generator).to(model.surface.device)
-    points = model.surface[pick][None].expand(len(batch.frame_idx), -1, -1)
-    placed = project(state.intrinsics, transform(state.camera_from_object, model.forward_points(state, points)))
-    size = max(max(v.width, v.height) for v in model.videos)
-    return losses.coverage_loss(placed, batch.pixels, uncovered, cap_px=0.15 * size)
+    placed = _placed(model, state, len(batch.frame_idx), generator)
+    return losses.coverage_loss(placed, batch.pixels, uncovered, cap_px=_farthest_px(model))
+
+
+def _spill(model: Banmo, state: FrameState, batch: Batch, generator: torch.Generator) -> Tensor:
+    """What pulls limbs back that stick out beside the object: no ray is drawn there to say so."""
+    placed = _placed(model, state, len(batch.frame_idx), generator)
+    return losses.spill_loss(placed * batch.beside_scale[..., None], batch.beside, batch.weight, _farthest_px(model))
 
 
 def _cycle_3d(model: Banmo, state: FrameState, seen: Rendered, draws: Draws) -> Tensor:

@@ -76,6 +76,10 @@ class PhaseSettings:
     """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag."""
     cover_from: float = 0.2
     """Share of the phase from which they do; before, limbs may not be there yet."""
+    weight_spill: float = 0.0
+    """Places of the surface that stick out beside the object's mask are pulled back onto it, in pixels."""
+    spill_from: float = 0.2
+    """Share of the phase from which they are."""
     weight_feature: float = 0.05
     """Rendered embedding against the pixel's features."""
     weight_match: float = 0.0
