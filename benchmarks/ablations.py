@@ -54,6 +54,7 @@ ROWS: dict[str, Row] = {
     "no-delta": Row(every={"delta_from": 2.0}),
     "no-rest": Row(every={"weight_rest": 0.0}),
     "no-cover": Row(fit={"weight_cover": 0.0}),
+    "no-spill": Row(fit={"weight_spill": 0.0}),
     "no-splines": Row(fit={"motion_spacing_s": 0.0}),
     "first-bones": Row(fit={"renew_at": 2.0}),
     "not-mended": Row(every={"mend": False}),

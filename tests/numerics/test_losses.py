@@ -233,3 +233,19 @@ def test_coverage_pulls_the_nearest_point_of_pixels_that_nothing_covers() -> Non
     assert float(value) == pytest.approx(((5 - 1) + (8 - 1) + 0.5**2 / 4) / 4, rel=1e-3)
     assert placed.grad is not None
     assert float(placed.grad[0, 0, 0]) < 0 and placed.grad[0, 1].abs().max() == 0 and placed.grad[0, 2].abs().max() == 0
+
+
+def test_spill_pulls_points_beside_the_mask_back_onto_it() -> None:
+    # A mask that fills the left 10 columns of a 40 x 20 map; a cell is two pixels of the frame wide.
+    column = torch.arange(40, dtype=torch.float32)
+    beside = (2 * (column - 9).clamp_min(0)).expand(1, 20, 40)
+    placed = torch.tensor([[[5.0, 10.0], [14.5, 10.0], [10.0, 10.0], [38.5, 10.0], [60.0, 10.0]]], requires_grad=True)
+    value = losses.spill_loss(placed, beside, torch.tensor([[0.5]]), cap_px=30.0)
+    value.backward()
+    # on the mask; 10 px beside it; 1 px (between two cells); 58 px, beyond the cap; beyond the picture
+    assert float(value) == pytest.approx(0.5 * (0 + (10 - 1) + 1 / 4 + (30 - 1) + 0) / 5)
+    assert placed.grad is not None
+    pull = placed.grad[0]
+    assert float(pull[1, 0]) == pytest.approx(0.5 * 2 / 5) and float(pull[2, 0]) > 0
+    assert pull[0].abs().max() == 0 and pull[3].abs().max() == 0 and pull[4].abs().max() == 0
+    assert pull[:, 1].abs().max() == 0
