@@ -76,6 +76,7 @@ def synthetic(frames: int, rows: int = 1500, seed: int = 0) -> tuple[Observation
         flow={s: torch.zeros(count, 2, dtype=torch.float16) for s in steps},
         flow_confidence={s: torch.full((count,), 200, dtype=torch.uint8) for s in steps},
         partner=partner,
+        beside=torch.zeros_like(small),
     )
     times = tuple(i / FPS for i in range(frames))
     centre = (SIDE_PX / 2, SIDE_PX / 2)

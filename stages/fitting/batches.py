@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from stages.fitting.observations import Observations
+from stages.fitting.observations import BESIDE_UNITS, Observations
 
 
 class Batch(NamedTuple):
@@ -126,9 +125,10 @@ def look(
 
 def _beside(observations: Observations, chosen: Tensor) -> Tensor:
     """(F, h, w) distance in pixels of the frame from the object's mask, on the small silhouettes; zero on it."""
-    off = (observations.silhouettes[chosen] <= 127).numpy().astype(np.uint8)
-    cells = np.stack([cv2.distanceTransform(map_, cv2.DIST_L2, 3) for map_ in off])
-    return torch.from_numpy(cells) / observations.silhouette_scale[chosen][:, None, None]
+    if observations.beside is None:
+        return torch.zeros(len(chosen), *observations.silhouettes.shape[1:])
+    cells = observations.beside[chosen].float() / BESIDE_UNITS
+    return cells / observations.silhouette_scale[chosen][:, None, None]
 
 
 def _features(observations: Observations, frame_idx: Tensor, pixels: Tensor) -> Tensor | None:

@@ -11,7 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+
+BESIDE_UNITS = 4
+"""Distances from a silhouette are kept in quarters of its pixels, up to 63 of them."""
 
 
 @dataclass
@@ -33,6 +37,7 @@ class Observations:
     partner: dict[int, Tensor] = field(default_factory=dict)  # step -> (T,) int64, -1 = none
     features: np.ndarray | None = None  # (T, 112, 112, 16) float16, may be memory-mapped
     crops: Tensor | None = None  # (T, 4): x0, y0, x1, y1 of the feature maps, pixels
+    beside: Tensor | None = None  # (T, h, w) uint8: distance from the silhouette, in 1 / BESIDE_UNITS of its pixels
 
     def __len__(self) -> int:
         return len(self.video_idx)
@@ -59,7 +64,6 @@ class ObservationBuilder:
         weight: float,
     ) -> None:
         """Add one frame: image (H, W, 3) uint8, mask (H, W) uint8, flow and confidence by step."""
-        from scipy.ndimage import distance_transform_edt
         from skimage.transform import resize
 
         height, width = mask.shape
@@ -100,6 +104,7 @@ class ObservationBuilder:
             video=np.int64(video_idx),
             weight=np.float32(weight if inside.any() else 0.0),
             small=canvas,
+            beside=_distance_beside(canvas > 127),
             scale=np.float32(size[1] / width),
             size=np.array([width, height], np.float32),
             count=np.int64(len(rows)),
@@ -134,4 +139,12 @@ class ObservationBuilder:
             partner=partner,
             features=features,
             crops=None if crops is None else torch.from_numpy(np.asarray(crops, np.float32)),
+            beside=torch.from_numpy(np.stack(self._frames["beside"])),
         )
+
+
+def _distance_beside(inside: np.ndarray) -> np.ndarray:
+    """(h, w) uint8 distance from `inside` (h, w), see BESIDE_UNITS; zero everywhere where there is no object."""
+    if not inside.any():
+        return np.zeros(inside.shape, np.uint8)
+    return np.round(np.minimum(BESIDE_UNITS * distance_transform_edt(~inside), 255)).astype(np.uint8)

@@ -7,7 +7,9 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
+from stages.fitting import batches
 from stages.fitting.batches import draw, step_generator
+from stages.fitting.observations import BESIDE_UNITS, ObservationBuilder
 from stages.geometry.cameras import project, transform
 from tests.numerics.analytic_scene import Scene, describe_point, look, scene, sphere
 
@@ -144,3 +146,18 @@ def test_picked_pixels_are_those_of_the_batch(seen: Scene) -> None:
             assert picked.features is not None and batch.features is not None
             assert torch.equal(picked.features[f, i], batch.features[f, column])
     assert picked.frame_idx is batch.frame_idx
+
+
+def test_batches_know_how_far_the_mask_is(seen: Scene) -> None:
+    batch = batches.look(seen.observations, torch.arange(len(seen.observations)), 4, step_generator(0, 0))
+    for frame, (beside, scale) in enumerate(zip(batch.beside, batch.beside_scale[:, 0].tolist(), strict=True)):
+        inside = seen.observations.silhouettes[frame].numpy() > 127
+        rows, columns = np.nonzero(inside)
+        for row, column in ((0, 0), (rows[0], columns[0]), (inside.shape[0] - 1, 3)):
+            nearest = np.hypot(rows - row, columns - column).min()
+            expected = min(nearest, 255 / BESIDE_UNITS) / scale
+            assert float(beside[row, column]) == pytest.approx(expected, abs=0.13 / scale)
+    empty = ObservationBuilder(())
+    empty.add(0, np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16), np.uint8), {}, 1.0)
+    observations = empty.finish()
+    assert observations.beside is not None and not observations.beside.any()
