@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.fitting.observations import BESIDE_UNITS, Observations
+from stages.fitting.observations import Observations
 
 
 class Batch(NamedTuple):
@@ -23,7 +23,7 @@ class Batch(NamedTuple):
     flow: Tensor  # (F, P, 2) pixels, to the partner frame
     flow_confidence: Tensor  # (F, P) in 0..1; zero where there is none
     features: Tensor | None  # (F, P, 16) unit length, or zero off the object
-    beside: Tensor  # (F, h, w) float32: pixels of the frame from each cell of a small picture to the mask
+    beside: Tensor | None  # (F, h, w) uint8: how far a cell of a small picture is from the mask (see Observations)
     beside_scale: Tensor  # (F, 1): cells of that picture a pixel of the frame
 
     def to(self, device: torch.device) -> Batch:
@@ -118,17 +118,9 @@ def look(
         flow=flow,
         flow_confidence=confidence,
         features=_features(observations, chosen, xy),
-        beside=_beside(observations, chosen),
+        beside=None if observations.beside is None else observations.beside[chosen],
         beside_scale=observations.silhouette_scale[chosen][:, None],
     )
-
-
-def _beside(observations: Observations, chosen: Tensor) -> Tensor:
-    """(F, h, w) distance in pixels of the frame from the object's mask, on the small silhouettes; zero on it."""
-    if observations.beside is None:
-        return torch.zeros(len(chosen), *observations.silhouettes.shape[1:])
-    cells = observations.beside[chosen].float() / BESIDE_UNITS
-    return cells / observations.silhouette_scale[chosen][:, None, None]
 
 
 def _features(observations: Observations, frame_idx: Tensor, pixels: Tensor) -> Tensor | None:

@@ -66,8 +66,8 @@ def mend(
         own = places[mine]
         gap, nearest = tree.query(own.numpy())
         closest = int(gap.argmin())
-        real = seen is None or float(seen(own[:: max(1, len(own) // 200)]).mean()) > _REAL_SHARE
-        if real and sizes[part] >= least_share * sizes[body] and gap[closest] <= reach:
+        within = sizes[part] >= least_share * sizes[body] and gap[closest] <= reach
+        if within and (seen is None or float(seen(own[:: max(1, len(own) // 200)]).mean()) > _REAL_SHARE):
             end = torch.from_numpy(np.asarray(tree.data[nearest[closest]], np.float32))
             changed = torch.minimum(changed, capsule(places, own[closest], end, radius))
             tree = cKDTree(np.concatenate([tree.data, own.numpy()]))

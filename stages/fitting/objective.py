@@ -9,6 +9,7 @@ from torch import Tensor
 
 from stages.fitting.active import Uncertainty
 from stages.fitting.batches import Batch, Draws
+from stages.fitting.observations import BESIDE_UNITS
 from stages.fitting.schedule import PhaseSettings, flow_speaks_alone
 from stages.fitting.team import ALONE, Team
 from stages.geometry.cameras import pixel_directions, project, ray_box, transform
@@ -151,11 +152,7 @@ def evaluate(
         flow = project(partner.intrinsics, moved) - batch.pixels
         weight = batch.flow_confidence * inside * opacity
         add("flow", settings.weight_flow, losses.flow_loss(flow, batch.flow, weight))
-    if settings.weight_cover and step >= settings.cover_from * settings.iterations and len(model.surface):
-        uncovered = inside * (opacity < 0.3)
-        add("cover", settings.weight_cover, _cover(model, state, batch, uncovered, generator))
-    if settings.weight_spill and step >= settings.spill_from * settings.iterations and len(model.surface):
-        add("spill", settings.weight_spill, _spill(model, state, batch, generator))
+    terms.update(_outline(model, state, batch, inside * (opacity < 0.3), settings, step, generator))
     if batch.features is not None:
         terms.update(_correspondence(model, state, batch, seen, inside * opacity, settings, step, draws))
     if settings.weight_cycle_3d:
@@ -170,28 +167,37 @@ def evaluate(
     return terms
 
 
-def _placed(model: Banmo, state: FrameState, frames: int, generator: torch.Generator) -> Tensor:
-    """Pixels (F, N, 2) of random points of the surface as posed in each frame."""
+def _outline(
+    model: Banmo,
+    state: FrameState,
+    batch: Batch,
+    uncovered: Tensor,
+    settings: PhaseSettings,
+    step: int,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """What pulls limbs where rendering has no gradient: onto pixels that nothing covers, and back from beside the mask.
+
+    Random points of the surface are posed and projected; no ray is drawn far beside the mask.
+    """
+    cover = settings.weight_cover > 0 and step >= settings.cover_from * settings.iterations
+    spill = settings.weight_spill > 0 and step >= settings.spill_from * settings.iterations and batch.beside is not None
+    terms: dict[str, Tensor] = {}
+    if not (cover or spill) or len(model.surface) == 0:
+        return terms
     pick = torch.randint(len(model.surface), (400,), generator=generator).to(model.surface.device)
-    points = model.surface[pick][None].expand(frames, -1, -1)
-    return project(state.intrinsics, transform(state.camera_from_object, model.forward_points(state, points)))
-
-
-def _farthest_px(model: Banmo) -> float:
-    """Beyond that distance nothing is pulled."""
-    return 0.15 * max(max(v.width, v.height) for v in model.videos)
-
-
-def _cover(model: Banmo, state: FrameState, batch: Batch, uncovered: Tensor, generator: torch.Generator) -> Tensor:
-    """What pulls lagging limbs: rendering has no gradient where nothing is drawn near a pixel of the object."""
-    placed = _placed(model, state, len(batch.frame_idx), generator)
-    return losses.coverage_loss(placed, batch.pixels, uncovered, cap_px=_farthest_px(model))
-
-
-def _spill(model: Banmo, state: FrameState, batch: Batch, generator: torch.Generator) -> Tensor:
-    """What pulls limbs back that stick out beside the object: no ray is drawn there to say so."""
-    placed = _placed(model, state, len(batch.frame_idx), generator)
-    return losses.spill_loss(placed * batch.beside_scale[..., None], batch.beside, batch.weight, _farthest_px(model))
+    points = model.surface[pick][None].expand(len(batch.frame_idx), -1, -1)
+    placed = project(state.intrinsics, transform(state.camera_from_object, model.forward_points(state, points)))
+    farthest_px = 0.15 * max(max(v.width, v.height) for v in model.videos)
+    if cover:
+        value = losses.coverage_loss(placed, batch.pixels, uncovered, cap_px=farthest_px)
+        terms["cover"] = settings.weight_cover * value
+    if spill and batch.beside is not None:
+        scale = batch.beside_scale[..., None]
+        beside_px = batch.beside.to(placed.dtype) / (BESIDE_UNITS * scale)
+        value = losses.spill_loss(placed * scale, beside_px, batch.weight, cap_px=farthest_px)
+        terms["spill"] = settings.weight_spill * value
+    return terms
 
 
 def _cycle_3d(model: Banmo, state: FrameState, seen: Rendered, draws: Draws) -> Tensor:

@@ -150,13 +150,14 @@ def test_picked_pixels_are_those_of_the_batch(seen: Scene) -> None:
 
 def test_batches_know_how_far_the_mask_is(seen: Scene) -> None:
     batch = batches.look(seen.observations, torch.arange(len(seen.observations)), 4, step_generator(0, 0))
-    for frame, (beside, scale) in enumerate(zip(batch.beside, batch.beside_scale[:, 0].tolist(), strict=True)):
+    assert batch.beside is not None
+    assert torch.equal(batch.beside_scale[:, 0], seen.observations.silhouette_scale)
+    for frame, beside in enumerate(batch.beside):
         inside = seen.observations.silhouettes[frame].numpy() > 127
         rows, columns = np.nonzero(inside)
         for row, column in ((0, 0), (rows[0], columns[0]), (inside.shape[0] - 1, 3)):
             nearest = np.hypot(rows - row, columns - column).min()
-            expected = min(nearest, 255 / BESIDE_UNITS) / scale
-            assert float(beside[row, column]) == pytest.approx(expected, abs=0.13 / scale)
+            assert int(beside[row, column]) == round(min(nearest * BESIDE_UNITS, 255))
     empty = ObservationBuilder(())
     empty.add(0, np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16), np.uint8), {}, 1.0)
     observations = empty.finish()
