@@ -235,3 +235,16 @@ def test_network_colour_sees_direction_and_light() -> None:
     assert torch.allclose(colour, field.shade(appearance, 5 * ahead, light), atol=1e-6)
     assert not torch.allclose(colour, field.shade(appearance, -ahead, light), atol=1e-4)
     assert not torch.allclose(colour, field.shade(appearance, ahead, light + 1), atol=1e-4)
+
+
+def test_coarse_grids_are_interpolated_as_torch_does_it() -> None:
+    field = GridField(torch.tensor([[-1.0, -0.5, -0.4], [1.0, 0.6, 0.5]]), 0.07, 4)
+    generator = torch.Generator().manual_seed(0)
+    for grid in field.sdf_grids:
+        torch.nn.init.normal_(grid, generator=generator)
+    wanted = sum(
+        torch.nn.functional.interpolate(grid, field.shape, mode="trilinear", align_corners=True)
+        for grid in field.sdf_grids
+    )
+    assert len({grid.shape for grid in field.sdf_grids}) == 3
+    assert torch.allclose(field.prepare()[:, :1], wanted, atol=1e-5)
