@@ -20,6 +20,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -31,6 +32,9 @@ from stages.fitting.schedule import PhaseSettings
 from stages.fitting.trainer import Trainer
 from stages.geometry.rotations import rigid, so3_exp
 from stages.model.banmo import Architecture, Banmo, VideoFacts
+
+if TYPE_CHECKING:  # what --data alone needs is imported where it is used
+    from benchmarks.trials import Phases, Seen
 
 log = logging.getLogger(__name__)
 
@@ -174,6 +178,22 @@ def scale(device: str, steps: int, counts: tuple[int, ...]) -> None:
         log.info("| %d | %.3f | %.2f | %.0f |", frames, each, each / first, rows / 1e6)
 
 
+def _cost(seen: Seen, settings: Phases, few: int = 6, more: int = 30) -> tuple[float, float]:
+    """Processor seconds that a reconstruction takes before its first step, and each step's; two short ones tell."""
+    from benchmarks.trials import reconstruct
+
+    fit, correct, refine = settings
+    phases = 2 if refine.iterations else 1
+
+    def spent(steps: int) -> float:
+        last = replace(refine, iterations=steps if refine.iterations else 0)
+        return reconstruct(seen, replace(fit, iterations=steps), correct, last)[1]
+
+    short, long = spent(few), spent(more)
+    each = (long - short) / (phases * (more - few))
+    return max(0.0, short - phases * few * each), each
+
+
 def accuracy(data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int) -> None:
     """Print what ours and the plain version reach after equal processor time."""
     from benchmarks.trials import judge, observe, presets, reconstruct, write_meshes
@@ -189,11 +209,9 @@ def accuracy(data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int) 
     log.info("| --- | --- | --- | --- | --- | --- | --- |")
     for wanted in minutes:
         for name, first, last in (("ours", fit, refine), ("plain", plain, replace(refine, iterations=0))):
-            few = replace(first, iterations=6), skipped, replace(last, iterations=6 if last.iterations else 0)
             # How many steps the time buys is measured; the shares of the phases stay those of the preset.
-            _, spent = reconstruct(seen, *few)
-            each = spent / (few[0].iterations + few[2].iterations)
-            total = wanted * 60 / each
+            start, each = _cost(seen, (first, skipped, last))
+            total = (wanted * 60 - start) / each
             share = first.iterations / (first.iterations + last.iterations)
             steps = round(total * share), round(total * (1 - share))
             settings = replace(first, iterations=steps[0]), skipped, replace(last, iterations=steps[1])
