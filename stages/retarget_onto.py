@@ -19,12 +19,12 @@ import torch
 
 from pipeline import BadInput, Folder, Resources, Run, Scene, stage
 from stages import formats
+from stages.fitting.known_poses import known_shapes, spread
 from stages.fitting.observations import ObservationBuilder
 from stages.meshing.skeleton import nearest_rigid
 from stages.model.banmo import Banmo
 from stages.own_skeletons import own_puppet
 from stages.retarget_files import read_posture, write_handed
-from stages.retargeting.articulation import known_shapes, spread
 from stages.retargeting.matching import ALIKE, handed, likeness, model_surface
 from stages.retargeting.placing import Placed, register, turn_onto
 

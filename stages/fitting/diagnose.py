@@ -24,6 +24,7 @@ class FrameFigures(NamedTuple):
     overlap: Tensor  # (T,) of rendered and seen silhouette near the object, as intersection over union, 0..1
     flow_px: Tensor  # (T,) median distance of rendered from seen flow where that is trusted
     feature: Tensor  # (T,) mean squared distance of rendered from seen features, 0..4
+    colour: Tensor  # (T,) mean distance of rendered from seen colour, 0..1 a channel
 
 
 @torch.no_grad()
@@ -39,7 +40,7 @@ def frame_figures(
 ) -> FrameFigures:
     """Render some `pixels` of each frame (of `most` frames, evenly spread, if there are more) and compare."""
     count, device = len(observations), model.base_poses.device
-    figures = torch.full((3, count), torch.nan)
+    figures = torch.full((4, count), torch.nan)
     usable = torch.nonzero(observations.frame_weight > 0)[:, 0]
     usable = usable[torch.linspace(0, len(usable) - 1, min(most, len(usable))).round().long()]
     prepared = model.field.prepare()
@@ -54,6 +55,8 @@ def frame_figures(
         union = torch.maximum(seen.opacity, batch.mask).sum(1)
         figures[0, part] = (torch.minimum(seen.opacity, batch.mask).sum(1) / union.clamp_min(1e-6)).cpu()
         inside = (batch.mask > 0.5) & (seen.opacity > 0.5)
+        distance = (seen.colour - batch.rgb).abs().mean(-1)
+        figures[3, part] = torch.where(inside, distance, torch.nan).nanmean(1).cpu()
         moved = transform(partner.camera_from_object, model.forward_points(partner, seen.surface))
         error = (project(partner.intrinsics, moved) - batch.pixels - batch.flow).norm(dim=-1)
         known = inside & (batch.flow_confidence > 0.5)

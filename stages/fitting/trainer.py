@@ -20,6 +20,7 @@ from stages.fitting.evidence import share_on_masks
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
 from stages.fitting.renew import renew_bones, renew_bounds
+from stages.fitting.rethink import Rethought, second_thoughts
 from stages.fitting.schedule import PhaseSettings, beta_at, rate_at
 from stages.fitting.surface import frame_boxes, surface_points
 from stages.fitting.team import ALONE, Team
@@ -43,6 +44,7 @@ class Trainer:
         self.rate_scale = 1.0
         self.trust = torch.ones(len(observations))
         self.renewal_error: float | None = None  # units; see renew_bones
+        self.rethought: Rethought | None = None
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
             octaves = model.architecture.octaves
@@ -122,6 +124,8 @@ class Trainer:
             self.refresh()
         if self.step_idx and self.step_idx == round(s.renew_at * s.iterations):
             self._renew()
+        if self.step_idx and self.step_idx in {round(at * s.iterations) for at in s.rethink_at}:
+            self._rethink()
         if self.step_idx and self.step_idx == round(s.reject_at * s.iterations):
             self._reject()
         if self.progress >= s.delta_from:
@@ -198,6 +202,31 @@ class Trainer:
         self._agree()
         self.refresh()
         self.optimiser = self._optimiser()
+
+    def _rethink(self) -> None:
+        """Other readings of what is explained badly; the motion's step sizes are learned anew where one is taken."""
+        s = self.settings
+        beta = max(beta_at(s, self.progress), self.model.beta_floor)
+        quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
+        still = replace(
+            s, **quiet, iterations=max(1, round(s.rethink_share * s.iterations / 2)), beta_start=beta, beta_end=beta,
+            cover_from=0.0, spill_from=0.0, decay_from=0.5, warmup_steps=10, active_share=0.0, flow_only_every=0,
+            renew_at=2.0, reject_at=2.0, rethink_at=(), delta_from=2.0, seed=s.seed + self.step_idx,
+        )  # fmt: skip
+
+        def practise(model: Banmo, seen: Observations) -> None:
+            trainer = Trainer(model, seen, still, self.team)
+            while not trainer.done:
+                trainer.step()
+
+        def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
+            return frame_figures(model, seen, frame_boxes(model), s, beta)
+
+        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, self.team.agree)
+        if self.rethought.taken:
+            self._agree()
+            self.refresh()
+            self.optimiser = self._optimiser()
 
     # ------------------------------------------------------------------------------------------ state
 

@@ -67,6 +67,13 @@ class FourierCode(nn.Module):
         own = self.coefficients.index_select(0, video_idx)
         return torch.einsum("nk,nkc->nc", self.basis(time), own)
 
+    @torch.no_grad()
+    def steer(self, video: int, time: Tensor, change: Tensor, ridge: float) -> None:
+        """Change a video's code by `change` (T, C) at times (T,), as far as its functions of time can (ridge)."""
+        basis = self.basis(time).double()
+        gram = basis.T @ basis + ridge * torch.eye(basis.shape[1], dtype=torch.float64, device=basis.device)
+        self.coefficients[video] += torch.linalg.solve(gram, basis.T @ change.double()).to(self.coefficients)
+
 
 class MotionHead(nn.Module):
     """Two hidden layers from a code to `count` rigid motions: rotation vectors and translations, near zero at first."""

@@ -8,8 +8,8 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from stages.fitting.known_poses import spread
 from stages.model.banmo import Banmo
-from stages.retargeting.articulation import spread
 from stages.retargeting.fitting import Effort, Posture, Surface, fit_surface, lay
 from stages.retargeting.handing import Handed, hand_on, hang
 from stages.retargeting.puppet import Puppet

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.fitting.known_poses import best_sequence, mask_distance, spread
 from stages.fitting.observations import Observations
 from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import geodesic_angle, matrix_to_quaternion, quaternion_to_matrix
-from stages.retargeting.articulation import best_sequence, mask_distance, spread
 
 _TURN_PRICE = 0.08
 """Misfit, in object sizes, that a turn by one radian a frame may cost: a jump to the far side must pay over frames."""

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from stages.fitting.known_poses import best_sequence, known_shapes, spread
 from stages.fitting.observations import ObservationBuilder
 from stages.fitting.surface import surface_points
 from stages.geometry.cameras import transform
 from stages.geometry.rotations import geodesic_angle, so3_exp
 from stages.model.banmo import Banmo, VideoFacts
-from stages.retargeting.articulation import best_sequence, first_articulation, known_shapes, spread
+from stages.retargeting.articulation import first_articulation
 from stages.retargeting.driven import ClipSettings, ClipTrainer, driven_model, known_codes, start_codes
 from stages.retargeting.growing import change_of_frame, grown
 from stages.retargeting.placing import directions, place_in_box, register, turn_onto

@@ -1,0 +1,89 @@
+"""Poses that a model has already been seen in, tried on other frames: how badly each lies on a mask, the best path.
+
+Codes found by descent alone stay in the swing they begin in. A model has been seen in hundreds of articulations; each
+is placed at a frame's root pose and compared with its mask as points: what falls outside the mask, and what of the
+mask no point comes near. Dynamic programming over time picks a sequence.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from stages.fitting.observations import Observations
+from stages.geometry.cameras import project, transform
+from stages.geometry.rotations import invert_rigid
+from stages.model.banmo import Banmo
+
+
+def spread(count: int, most: int) -> Tensor:
+    """Up to `most` indices (N,) spread evenly over `count`."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long().unique()
+
+
+@torch.no_grad()
+def known_shapes(model: Banmo, frames: Tensor, points: Tensor) -> Tensor:
+    """Surface points (N, 3) posed as in kept frames (K,) of the known model, (K, N, 3), by the bones alone.
+
+    The part of a motion that was moved from the bones to the root pose (``model.gauge``) is taken off again: codes
+    drive bones.
+    """
+    parts = []
+    for chunk in frames.split(32):
+        posed = model.forward_points(model.frames(chunk), points[None].expand(len(chunk), -1, -1))
+        parts.append(transform(invert_rigid(model.gauge[chunk]), posed))
+    return torch.cat(parts)
+
+
+def mask_distance(silhouette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance in pixels (H, W) to the object, zero on it; and some of its pixels (M, 2), column and row centres.
+
+    The pixels are spread evenly, so that a thin limb counts by its length.
+    """
+    inside = silhouette > 127
+    rows, columns = np.nonzero(inside)
+    step = max(1, len(rows) // 96)
+    some = np.stack([columns[::step], rows[::step]], axis=1).astype(np.float32) + 0.5
+    return distance_transform_edt(~inside).astype(np.float32), some
+
+
+@torch.no_grad()
+def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frames: Tensor) -> Tensor:
+    """How badly each known shape (K, N, 3) fits each of `frames` (T,): (T, K), in object sizes; zero is perfect.
+
+    Args:
+        poses: (T, 4, 4) camera_from_object of those frames.
+        intrinsics: (T, 3, 3) pixels of those frames.
+    """
+    cost = torch.zeros(len(frames), len(shapes))
+    for t, frame in enumerate(frames.tolist()):
+        if float(observations.frame_weight[frame]) <= 0:
+            continue
+        scale = float(observations.silhouette_scale[frame])
+        outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
+        placed = transform(poses[t], shapes.reshape(-1, 3))
+        pixels = project(intrinsics[t], placed).reshape(*shapes.shape[:2], 2) * scale
+        height, width = outside.shape
+        column = pixels[..., 0].floor().long().clamp(0, width - 1)
+        row = pixels[..., 1].floor().long().clamp(0, height - 1)
+        beyond = torch.from_numpy(outside)[row, column].mean(1)
+        bare = torch.cdist(torch.from_numpy(wanted)[None].expand(len(shapes), -1, -1), pixels).amin(-1)
+        size = max(8.0, float(np.sqrt(len(wanted) and (outside == 0).sum())))
+        cost[t] = (beyond + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size
+    return cost
+
+
+def best_sequence(cost: Tensor, jump: Tensor) -> Tensor:
+    """Indices (T,) of least total cost (T, K) plus price of going from one to the next (K, K) (Viterbi)."""
+    total, back = cost[0].clone(), []
+    for t in range(1, len(cost)):
+        ways = total[:, None] + jump
+        best, where = ways.min(0)
+        back.append(where)
+        total = best + cost[t]
+    path = [int(total.argmin())]
+    for where in reversed(back):
+        path.append(int(where[path[-1]]))
+    return torch.tensor(path[::-1])

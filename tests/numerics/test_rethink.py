@@ -1,0 +1,163 @@
+"""Second thoughts: who is asked again, what else it might be, and that only what is better is taken."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from stages.fitting import rethink
+from stages.fitting.diagnose import FrameFigures
+from stages.fitting.observations import Observations
+from stages.fitting.surface import surface_points
+from stages.fitting.trainer import Trainer
+from stages.model.banmo import Banmo, VideoFacts
+from stages.model.motion import FourierCode
+from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, orbit, scene, stir, tiny_settings
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+FRAMES = 40
+RADII = torch.tensor([0.3, 0.2, 0.6])
+
+
+@pytest.fixture(scope="module")
+def seen() -> Scene:
+    return scene(ellipsoid(RADII), frames=6)
+
+
+def solid(points: torch.Tensor) -> torch.Tensor:
+    return ((points / RADII).norm(dim=-1) - 1) * float(RADII.min())
+
+
+@pytest.fixture
+def model(seen: Scene) -> Banmo:
+    """Two clips of 40 frames, 20 a second, of a body that moves."""
+    found = model_of(seen, solid)
+    videos = [
+        VideoFacts(f"clip{v}", tuple(0.05 * i for i in range(FRAMES)), 48, 40, (44.0, 44.0), (24.0, 20.0))
+        for v in range(2)
+    ]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        generator = torch.Generator().manual_seed(0)
+        long = Banmo(found.architecture, videos, orbit(2 * FRAMES, 0.0), found.bounds, found.bones, generator)
+    long.field.load_state_dict(found.field.state_dict())
+    stir(long, 1.5)
+    long.surface = surface_points(long, 48)
+    return long
+
+
+def observations(count: int) -> Observations:
+    """Only what says which frames may be used."""
+    empty = torch.zeros(0)
+    return Observations(
+        torch.arange(count) // FRAMES, torch.ones(count), empty, empty, empty, empty, empty,
+        torch.full((count, 32, 32), 255, dtype=torch.uint8), torch.full((count,), 32 / 48), torch.tensor([48.0, 40.0]),
+    )  # fmt: skip
+
+
+def codes(model: Banmo) -> torch.Tensor:
+    return model.body.code(model.video_idx, model.time).detach()
+
+
+def test_a_code_is_steered_where_it_is_told_and_stays_elsewhere() -> None:
+    code = FourierCode(2, 6, 3, torch.Generator().manual_seed(0), splines=43)
+    time = torch.linspace(-1, 1, FRAMES)
+    before = code(torch.zeros(FRAMES, dtype=torch.int64), time).detach()
+    other = code.coefficients[1].clone()
+    change = torch.zeros(FRAMES, 6)
+    change[15:25] = torch.randn(6, generator=torch.Generator().manual_seed(1))
+    code.steer(0, time, change, ridge=1e-3)
+    after = code(torch.zeros(FRAMES, dtype=torch.int64), time).detach()
+    assert torch.allclose(after, before + change, atol=0.02)
+    assert torch.equal(code.coefficients[1], other)
+
+
+def test_a_stretch_is_doubted_but_no_single_frame_and_no_clip_as_a_whole(model: Banmo) -> None:
+    error = torch.ones(2 * FRAMES)
+    error[10:20] = 1.5
+    error[30] = 1.2
+    error[FRAMES:] = 3.0  # bad, but no worse in one place than in another
+    error[5] = torch.nan
+    found = torch.nonzero(rethink.doubtful(error, model))[:, 0]
+    assert found.min() in range(7, 11) and found.max() in range(19, 23)
+    assert set(range(10, 20)) <= set(found.tolist())
+    assert not rethink.doubtful(torch.full((2 * FRAMES,), torch.nan), model).any()
+
+
+def test_what_is_gained_briefly_or_barely_is_not_taken(model: Banmo) -> None:
+    asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
+    asked[5:35] = asked[45:75] = True
+    gain = torch.zeros(2 * FRAMES)
+    gain[10:30] = 0.3
+    gain[50:70] = 0.01
+    found = torch.nonzero(rethink.better(gain, asked, model))[:, 0]
+    assert set(range(10, 30)) <= set(found.tolist()) <= set(range(7, 33))
+    gain[10:30], gain[20] = -0.1, 0.5
+    assert not rethink.better(gain, asked, model).any()
+
+
+def test_the_other_reading_is_another_pose(model: Banmo) -> None:
+    asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
+    asked[10:20] = True
+    known = observations(2 * FRAMES)
+    wanted = rethink.other_reading(model, known, asked)
+    assert torch.equal(wanted >= 0, asked)
+    points = model.surface[:: max(1, len(model.surface) // 160)]
+    shapes = rethink.known_shapes(model, torch.arange(2 * FRAMES), points)
+    apart = (shapes[wanted[asked]] - shapes[asked]).square().sum(-1).mean(-1).sqrt()
+    assert float(apart.min()) > 0.9 * rethink._APART
+    known.frame_weight[:] = 0
+    assert (rethink.other_reading(model, known, asked) < 0).all()
+
+
+@pytest.mark.parametrize("helps", [True, False])
+def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) -> None:
+    """Figures as they would be if some frames' own codes were right, or the other ones."""
+    before = codes(model)
+    known, stretch = observations(2 * FRAMES), slice(10, 22)
+    practised = []
+
+    def figures_of(some: Banmo, focus: Observations) -> FrameFigures:
+        moved = (codes(some) - before).norm(dim=1) > 0.1 * float(before.norm(dim=1).mean())
+        error = torch.full((2 * FRAMES,), 0.1)
+        error[stretch] = 0.2
+        error[moved] = 0.1 if helps else 0.3
+        error[focus.frame_weight == 0] = torch.nan
+        return FrameFigures(1 - error, error, torch.full_like(error, torch.nan), error)
+
+    def practise(some: Banmo, focus: Observations) -> None:
+        assert some is not model and bool((focus.frame_weight[:5] == 0).all())
+        practised.append(some)
+
+    told = rethink.second_thoughts(model, known, figures_of, practise)
+    assert len(practised) == 2 and told.looked_at >= 12
+    change = (codes(model) - before).norm(dim=1)
+    if not helps:
+        assert told.taken == 0 and float(change.max()) == 0
+        return
+    assert told.taken >= 8
+    assert float(change[stretch].mean()) > 5 * float(change[25:].mean())
+    assert float(change[FRAMES:].max()) == 0, "the other clip has a code of its own"
+
+
+def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene) -> None:
+    settings = tiny_settings(iterations=6, rethink_at=(0.5,), rethink_share=0.7)
+
+    def start() -> Trainer:
+        model = model_of(seen, solid)
+        stir(model, 0.1)
+        return Trainer(model, seen.observations, settings)
+
+    one, states = start(), []
+    while not one.done:
+        assert (one.rethought is not None) == (one.step_idx > 3)
+        states.append(one.state())
+        one.step()
+    for at in (3, 4):
+        two = start()
+        two.restore(states[at])
+        while not two.done:
+            two.step()
+        for name, value in two.state().items():
+            assert torch.equal(value, one.state()[name]), name
