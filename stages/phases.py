@@ -99,14 +99,21 @@ def _train(
         trainer.settings = settings
         run.metric("steps", settings.iterations)
     team.wait()  # until all have read the same checkpoint
-    setbacks = 0
+    setbacks, reread = 0, (0, 0)
 
     def save() -> None:
         if team.leads:
             checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
 
+    def pause() -> None:
+        """Second thoughts take a while: nothing is lost but them and the steps since the last checkpoint."""
+        if team.any(run.stop_requested, device):
+            run.interrupt()
+        run.tick(trainer.step_idx, settings.iterations, "having second thoughts")
+
     if saved is None:
         save()
+    trainer.pause = pause
     while not trainer.done:
         if team.any(run.stop_requested, device):
             save()
@@ -124,13 +131,20 @@ def _train(
             model = Banmo.restore(saved.model_tensors(), saved.description).to(device)
             trainer = Trainer(model, collection.observations, settings, team)
             trainer.restore(saved.tensors)
-            trainer.rate_scale, history = scale, saved.history
+            trainer.rate_scale, history, trainer.pause = scale, saved.history, pause
             team.wait()
             continue
         if trainer.renewal_error is not None:
             run.log.info("new bones follow the old motion to %.4f units (rms)", trainer.renewal_error)
             run.metric("renewed_bones_rms", round(trainer.renewal_error, 5))
             trainer.renewal_error = None
+        if trainer.rethought is not None:
+            looked_at, taken = trainer.rethought
+            run.log.info("second thoughts: %d frames looked at, %d read anew", looked_at, taken)
+            reread = (reread[0] + looked_at, reread[1] + taken)
+            run.metric("frames_doubted", reread[0])
+            run.metric("frames_reread", reread[1])
+            trainer.rethought = None
         if trainer.step_idx % _METRIC_STEPS == 0 or trainer.done:
             history.append({"step": trainer.step_idx, **{k: round(v, 7) for k, v in values.items()}})
         run.tick(trainer.step_idx, settings.iterations, label, loss=values["total"])

@@ -7,6 +7,7 @@ Resuming is exact: all randomness comes from (seed, step), and everything a step
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -45,6 +46,7 @@ class Trainer:
         self.trust = torch.ones(len(observations))
         self.renewal_error: float | None = None  # units; see renew_bones
         self.rethought: Rethought | None = None
+        self.pause: Callable[[], None] = lambda: None  # called during long work between two steps; may raise
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
             octaves = model.architecture.octaves
@@ -217,6 +219,7 @@ class Trainer:
         def practise(model: Banmo, seen: Observations) -> None:
             trainer = Trainer(model, seen, still, self.team)
             while not trainer.done:
+                self.pause()
                 trainer.step()
 
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:

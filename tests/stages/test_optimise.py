@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from stages import formats, optimise, phases
 from stages.checkpoint import Checkpoints
 from stages.collect import Collection
 from stages.fitting import trainer as training
+from stages.fitting.rethink import Rethought
 from stages.model.banmo import Banmo
 from tests.numerics.analytic_scene import model_of, scene, sphere, stir, tiny_settings
 
@@ -138,6 +141,40 @@ def test_a_killed_phase_ends_as_an_undisturbed_one(
     assert latest is not None and latest.step == 3
     work(collection, tmp_path / "out", Run(checkpoint_dir=tmp_path / "points"))
     assert contents(tmp_path / "out") == undisturbed
+
+
+def test_second_thoughts_are_left_when_asked_to_stop(
+    collection: Collection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are long: what is lost is they and the steps since the last checkpoint, and the end is the same."""
+
+    def thinks_about_everything(model: Banmo, seen: Any, figures: Any, practise: Any, agree: Any) -> Rethought:
+        practise(deepcopy(model), seen)
+        return Rethought(6, 0)
+
+    class StopsThinking(Run):
+        def tick(self, done: float, total: float = 0, label: str = "", **extra: Any) -> None:
+            if label == "having second thoughts":
+                self.request_stop()
+
+    monkeypatch.setattr(training, "second_thoughts", thinks_about_everything)
+    settings = replace(SETTINGS, rethink_at=(0.6,), rethink_share=0.8)
+
+    def think(name: str, run: Run) -> dict[str, bytes]:
+        (tmp_path / name).mkdir()
+        checkpoints = Checkpoints(run.checkpoint_dir)
+        saved = checkpoints.latest()
+        model = first_model() if saved is None else Banmo.restore(saved.model_tensors(), saved.description)
+        phases.run_phase(model, collection, settings, checkpoints, tmp_path / name, run, "fitting")
+        return contents(tmp_path / name)
+
+    with pytest.raises(Interrupted):
+        think("stopped", StopsThinking(checkpoint_dir=tmp_path / "points"))
+    latest = Checkpoints(tmp_path / "points").latest()
+    assert latest is not None and latest.step == 3
+    run = Run(checkpoint_dir=tmp_path / "points")
+    assert think("resumed", run) == think("straight", Run(checkpoint_dir=tmp_path / "others"))
+    assert run.metrics["frames_doubted"] == 6 and run.metrics["frames_reread"] == 0
 
 
 def failing_at(call: int, failure: Exception | None = None, every: bool = False) -> Callable[..., dict]:
