@@ -1,14 +1,16 @@
 """The rows of the paper's ablation table, on one object of an evaluation data set with true masks and root poses.
 
-``python -m benchmarks.ablations --data DATA/fox --evaluate evaluate.py [--rows full bones-9 ...] [--scale 0.7]``
+``python -m benchmarks.ablations --workspace W --data DATA/fox --evaluate evaluate.py [--rows full bones-9 ...]``
 
-Every row is the preset with one thing changed; all see the same frames. Prints a table as rows finish. Phase two is
-left out unless features are read, as it has nothing to go by without them.
+W holds what the product's stages make of that object: ``python -m benchmarks.tier_a --data DATA/fox --out IN``, then
+``banmo run IN --workspace W --stage poses``. Every row is the preset with one thing changed; all see the same frames.
+Prints each row as soon as it is done.
 """
 
 from __future__ import annotations
 
 import logging
+import sys
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,9 +19,13 @@ from typing import Any
 import torch
 import tyro
 
-from benchmarks.trials import judge, observe, presets, reconstruct, shaken, write_meshes
+from benchmarks.trials import Phases, judge, observe, presets, reconstruct, shaken, steadied, write_meshes
+from pipeline import BadInput
+from stages.fitting.trainer import Diverged
 
 log = logging.getLogger(__name__)
+PAPER = ("full", "bones-9", "no-features", "no-cycle-3d", "no-flow", "no-in-surface", "se3", "translation", "clips-2")
+NO_FEATURES = {"weight_feature": 0.0, "weight_match": 0.0, "weight_cycle_2d": 0.0}
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,9 @@ ROWS: dict[str, Row] = {
     "se3": Row(fit={"deformation": "se3"}),
     "translation": Row(fit={"deformation": "translation"}),
     "dual-quaternions": Row(fit={"blending": "dual_quaternion"}),
-    "no-registration": Row(every={"weight_feature": 0.0, "weight_cycle_2d": 0.0, "weight_cycle_3d": 0.0}),
+    "no-features": Row(every=NO_FEATURES),
+    "no-cycle-3d": Row(every={"weight_cycle_3d": 0.0}),
+    "no-registration": Row(every={**NO_FEATURES, "weight_cycle_3d": 0.0}),
     "no-flow": Row(every={"weight_flow": 0.0}),
     "no-root-init": Row(no_roots=True, given_roots=False),
     "no-colour": Row(every={"weight_rgb": 0.0}),
@@ -65,10 +73,17 @@ ROWS: dict[str, Row] = {
 }
 
 
+def changed(row: Row, phases: Phases) -> Phases:
+    """The settings of a row, from those of the full one."""
+    fit, correct, refine = phases
+    return replace(fit, **row.every, **row.fit), replace(correct, **row.every), replace(refine, **row.every)
+
+
 def main(
+    workspace: Path,
     data: Path,
     evaluate: Path,
-    rows: tuple[str, ...] = ("full", "bones-9", "no-flow", "no-in-surface", "se3", "translation", "clips-2"),
+    rows: tuple[str, ...] = PAPER,
     preset: str = "preview",
     scale: float = 1.0,
     seed: int = 0,
@@ -77,7 +92,8 @@ def main(
     """Reconstruct once a row and print the paper's table.
 
     Args:
-        data: Folder of one object of the evaluation data set.
+        workspace: Where the stages up to `poses` have run, with true masks and root poses given.
+        data: Folder of the same object of the evaluation data set.
         evaluate: Path of the evaluation script.
         rows: Which rows, in this order (see ROWS in this file).
         preset: Whose settings are changed.
@@ -85,24 +101,31 @@ def main(
         seed: Of every fit.
         threads: Of the processor.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    # a handler flushes after every line: a run that is killed keeps its rows
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(threads)
     unknown = [r for r in rows if r not in ROWS]
     if unknown:
         raise SystemExit(f"no row {unknown[0]!r}; there are {', '.join(ROWS)}")
+    phases = presets(preset, scale, seed)
+    try:
+        whole = observe(workspace, steps=phases[0].flow_steps)
+    except BadInput as error:
+        raise SystemExit(str(error)) from error
     log.info("| %s | CD cm | pred>gt | gt>pred | F@1 | F@2 | F@5 | CPU s |", data.name)
     log.info("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    whole = observe(data)
     for name in rows:
         row = ROWS[name]
-        seen = whole if row.clips >= 5 else observe(data, clips=row.clips)
+        seen = whole if row.clips >= 5 else observe(workspace, row.clips, phases[0].flow_steps)
         if row.noise_deg:
-            seen = replace(seen, poses=shaken(seen.poses, row.noise_deg, seed))
+            seen = steadied(replace(seen, poses=shaken(seen.poses, row.noise_deg, seed)))
         if row.no_roots:
             seen = replace(seen, poses=seen.poses[:1].expand(len(seen.poses), 4, 4).clone())
-        fit, correct, refine = presets(preset, scale, seed)
-        fit, refine = replace(fit, **row.every, **row.fit), replace(refine, **row.every)
-        model, seconds = reconstruct(seen, fit, replace(correct, iterations=0), refine, hold_roots=row.given_roots)
+        try:
+            model, seconds = reconstruct(seen, *changed(row, phases), hold_roots=row.given_roots)
+        except (Diverged, BadInput) as error:  # the rows after it are worth having
+            log.info("| %s | %s |", name, error)
+            continue
         with tempfile.TemporaryDirectory(prefix="ablation-") as folder:
             write_meshes(model, Path(folder))
             s = judge(evaluate, data, Path(folder), clips=row.clips)

@@ -1,12 +1,12 @@
 """How fast a step of the optimiser is, against a plain version of the paper's and against its own parts.
 
 ``python -m benchmarks.optimiser [--device cuda] [--threads 2] [--steps 8] [--frames 100 1000 10000]``
-``python -m benchmarks.optimiser --data DATA/fox --evaluate evaluate.py --minutes 2 5``
+``python -m benchmarks.optimiser --workspace W --data DATA/fox --evaluate evaluate.py --minutes 2 5``
 
 Needs torch, numpy, scipy and scikit-image alone unless --data is given. The first table renders the same rays with the
 same number of samples: *ours* finds the surface with a probe without gradient and spends gradients near it; *plain*
 is the paper's network, 8 x 256, 32-bit, every sample with gradient. The second lets the number of frames grow. With
---data both versions learn one object for the same processor time.
+--data both learn one object, as a workspace has it (see ``benchmarks.ablations``), for the same processor time.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def scale(device: str, steps: int, counts: tuple[int, ...]) -> None:
         log.info("| %d | %.3f | %.2f | %.0f |", frames, each, each / first, rows / 1e6)
 
 
-def _cost(seen: Seen, settings: Phases, few: int = 6, more: int = 30) -> tuple[float, float]:
+def _cost(seen: Seen, settings: Phases, few: int = 20, more: int = 80) -> tuple[float, float]:
     """Processor seconds that a reconstruction takes before its first step, and each step's; two short ones tell."""
     from benchmarks.trials import reconstruct
 
@@ -194,11 +194,11 @@ def _cost(seen: Seen, settings: Phases, few: int = 6, more: int = 30) -> tuple[f
     return max(0.0, short - phases * few * each), each
 
 
-def accuracy(data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int) -> None:
+def accuracy(workspace: Path, data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int) -> None:
     """Print what ours and the plain version reach after equal processor time."""
     from benchmarks.trials import judge, observe, presets, reconstruct, write_meshes
 
-    seen = observe(data)
+    seen = observe(workspace)
     fit, correct, refine = presets("preview", seed=seed)
     skipped = replace(correct, iterations=0)
     plain = replace(
@@ -233,6 +233,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8, help="timed steps; the median counts")
     parser.add_argument("--frames", type=int, nargs="*", default=(100, 1000, 10_000))
     parser.add_argument("--data", type=Path, help="one object of the evaluation data set: compare at equal time")
+    parser.add_argument("--workspace", type=Path, help="where the stages up to poses made something of it")
     parser.add_argument("--evaluate", type=Path, help="the evaluation script")
     parser.add_argument("--minutes", type=float, nargs="*", default=(2.0, 5.0, 10.0))
     parser.add_argument("--seed", type=int, default=0)
@@ -240,9 +241,9 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(args.threads)
     if args.data is not None:
-        if args.evaluate is None:
-            parser.error("--data needs --evaluate")
-        accuracy(args.data, args.evaluate, tuple(args.minutes), args.seed)
+        if args.evaluate is None or args.workspace is None:
+            parser.error("--data needs --workspace and --evaluate")
+        accuracy(args.workspace, args.data, args.evaluate, tuple(args.minutes), args.seed)
         return
     speed(args.device, args.steps)
     if args.frames:

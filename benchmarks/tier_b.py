@@ -1,91 +1,61 @@
-"""Root poses that are wrong by some degrees a frame, and what the fit makes of them.
+"""Put wrong root poses beside the clips: each frame's true rotation turned by some degrees about an axis drawn evenly.
 
-``python -m benchmarks.tier_b --data DATA/fox --evaluate evaluate.py --degrees 20 50 [--seed 0] [--scale 1]``
+``python -m benchmarks.tier_b --data DATA/fox --out DIR --degrees 20 [--seed 0] [--look clean]``
 
-True masks; each frame's root rotation is turned by the given angle about an axis drawn evenly (seeded). Prints, for
-zero and each angle, the rotation error before and after (one global rotation removed) and the mesh scores.
+Clips and true masks lie in DIR as ``benchmarks.tier_a`` lays them, ``NAME.poses.json`` beside them is wrong. Then
+``banmo run DIR --workspace W --poses.refine true`` takes the jitter out and moves the poses, and ``benchmarks.score``
+tells how far they are from the truth afterwards (degrees, mean and standard deviation, one global rotation removed)
+and how good the meshes are. ``evaluate.py pose --pred W/latest/poses`` tells it of the poses that the fit began with.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
-import tempfile
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
-from benchmarks.trials import Seen, judge, observe, presets, reconstruct, shaken, write_meshes
-from stages.geometry.rotations import so3_log
-from stages.registration.steadying import steady
+from benchmarks.tier_a import place
+from benchmarks.trials import shaken
 
 log = logging.getLogger(__name__)
 
 
-def rotation_error_deg(found: Tensor, truth: Tensor) -> tuple[float, float]:
-    """Mean and standard deviation (degrees) of the angle between rotations (T, 3, 3), after one global rotation.
-
-    The global rotation is the one that brings ``found`` nearest to ``truth`` from the right (chordal distance): which
-    way canonical space is turned is free.
-    """
-    u, _, vt = torch.linalg.svd((found.double().transpose(1, 2) @ truth.double()).mean(0))
-    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vt).sign())], dtype=torch.float64))
-    rest = (found.double() @ (u @ flip @ vt)).transpose(1, 2) @ truth.double()
-    angle = so3_log(rest).norm(dim=-1).rad2deg()
-    return float(angle.mean()), float(angle.std())
-
-
-def steadied(seen: Seen) -> Tensor:
-    """Root poses (T, 4, 4) without their jitter, clip by clip."""
-    lengths = [len(video.time_s) for video in seen.videos]
-    tracks = [track.double().numpy() for track in seen.poses.split(lengths)]
-    made, _, _ = steady(tracks, [np.array(video.time_s) for video in seen.videos])
-    return torch.from_numpy(np.concatenate(made)).float()
+def place_turned(data: Path, look: str, out: Path, degrees: float, seed: int = 0) -> list[Path]:
+    """Fill `out`; returns what was put there. Raises FileNotFoundError naming what the data set lacks."""
+    placed = place(data, look, out, without="poses")
+    paths = [data / look / "gt" / f"{video.stem}.json" for video in sorted((data / look / "videos").glob("*.mp4"))]
+    documents = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    true = [torch.tensor(document["object_to_camera"]) for document in documents]
+    turned = shaken(torch.cat(true), degrees, seed).split([len(poses) for poses in true])
+    for path, document, poses in zip(paths, documents, turned, strict=True):
+        target = out / f"{path.stem}.poses.json"
+        target.unlink(missing_ok=True)  # what tier_a laid here is a link into the data set
+        target.write_text(json.dumps({**document, "object_to_camera": poses.tolist()}) + "\n", encoding="utf-8")
+        placed.append(target)
+    return placed
 
 
-def main(
-    data: Path, evaluate: Path, degrees: tuple[float, ...] = (20.0, 50.0), preset: str = "preview", seed: int = 0,
-    scale: float = 1.0,
-) -> None:  # fmt: skip
-    """Reconstruct with root poses perturbed by the given angles.
+def main(data: Path, out: Path, degrees: float = 20.0, seed: int = 0, look: str = "clean") -> None:
+    """Put true masks and wrong root poses beside the clips of an evaluation data set.
 
     Args:
-        data: Folder of one object of the evaluation data set.
-        evaluate: Path of the evaluation script.
-        degrees: Angles of the perturbation.
-        preset: Whose settings are used.
-        seed: Of perturbation and fit.
-        scale: Multiplies every phase's number of steps.
+        data: Folder of one object of the data set.
+        out: Folder to fill.
+        degrees: How far each frame's rotation is turned.
+        seed: Of the axes.
+        look: Which look of the object: clean or casual.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    torch.set_num_threads(2)
-    seen = observe(data)
-    settings = presets(preset, scale, seed)
-    log.info("| turned by | error before | after | CD cm | pred>gt | gt>pred | F@1 | F@2 | F@5 | s |")
-    log.info("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
-    for angle in (0.0, *degrees):
-        wrong = replace(seen, poses=shaken(seen.poses, angle, seed))
-        before = rotation_error_deg(wrong.poses[:, :3, :3], seen.poses[:, :3, :3])
-        if angle:  # as the poses stage does with poses.refine = true
-            wrong = replace(wrong, poses=steadied(wrong))
-        model, seconds = reconstruct(wrong, *settings, hold_roots=angle == 0)
-        with torch.no_grad():
-            after = rotation_error_deg(
-                model.frames(torch.arange(len(seen.poses))).camera_from_object[:, :3, :3], seen.poses[:, :3, :3]
-            )
-        with tempfile.TemporaryDirectory(prefix="tier-b-") as folder:
-            write_meshes(model, Path(folder))
-            s = judge(evaluate, data, Path(folder))
-        log.info(
-            "| %.0f deg | %.1f +- %.1f | %.1f +- %.1f | %.2f | %.2f | %.2f | %.1f | %.1f | %.1f | %.0f |",
-            *(angle, *before, *after, s.chamfer, s.to_truth, s.from_truth, s.f1, s.f2, s.f5, seconds),
-        )
-    if not np.isfinite(s.chamfer):
-        sys.exit(1)
+    try:
+        placed = place_turned(data, look, out, degrees, seed)
+    except OSError as error:
+        log.error("%s", error)
+        sys.exit(2)
+    log.info("%d files in %s; now: banmo run %s --poses.refine true", len(placed), out, out)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""What the accuracy benchmarks share: an evaluation data set as observations, the three phases in one process, scores.
+"""What the accuracy benchmarks share: a workspace's clips as observations, the three phases in one process, scores.
 
-No workspace is involved: clips, true masks and root poses are read straight from the data set, flow is computed as
-the `flow` stage does, and features are left out. Scores come from an evaluation script given by its path.
+Frames, masks, flow, features and root poses are what the product's own stages made of them; the phases start and end
+as theirs do. Scores come from an evaluation script given by its path.
 """
 
 from __future__ import annotations
 
-import json
+import logging
+import os
 import re
 import subprocess
 import sys
@@ -20,16 +21,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline import BadInput, Results, Run
+from stages.collect import Collection, collect
 from stages.fitting import initialise
 from stages.fitting.gauge import settle
-from stages.fitting.observations import ObservationBuilder, Observations
+from stages.fitting.observations import Observations
 from stages.fitting.surface import sample_volume
 from stages.fitting.trainer import Trainer
 from stages.geometry.rotations import rigid, so3_exp
-from stages.model.banmo import Architecture, Banmo, VideoFacts
-from stages.optimise import CorrectSettings, FitSettings, RefineSettings
+from stages.model.banmo import Banmo, VideoFacts
+from stages.optimise import CorrectSettings, FitSettings, RefineSettings, _first
+from stages.registration.steadying import steady
 
-HULL_VOXEL = 0.032
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -55,45 +58,28 @@ class Score:
     f5: float
 
 
-def observe(data: Path, look: str = "clean", clips: int = 5, steps: tuple[int, ...] = (1, 4)) -> Seen:
-    """Read the first `clips` clips of one object of the data set."""
-    import cv2
+def observe(workspace: Path, clips: int = 5, steps: tuple[int, ...] = FitSettings.flow_steps) -> Seen:
+    """Read the first `clips` clips of a workspace whose stages up to `poses` have run.
 
-    from stages.perception.optical_flow import Matcher, confidence
-    from stages.video_io import read_pictures
-
-    matcher, signed = Matcher("medium"), tuple(s * sign for s in steps for sign in (1, -1))
-    builder = ObservationBuilder(steps=signed)
-    poses, intrinsics, videos = [], [], []
-    for v, path in enumerate(sorted((data / look / "videos").glob("*.mp4"))[:clips]):
-        truth = json.loads((data / look / "gt" / f"{path.stem}.json").read_text(encoding="utf-8"))
-        packed = np.load(data / look / "gt" / f"{path.stem}-mask.npz")
-        shape = tuple(packed["shape"])
-        masks = np.unpackbits(packed["packed"])[: np.prod(shape)].reshape(shape)
-        images = read_pictures(path, len(masks))
-        grey = [cv2.cvtColor(i, cv2.COLOR_RGB2GRAY) for i in images]
-        flows: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-        for s in steps:
-            for i in range(len(images) - s):
-                forward, backward = matcher(grey[i], grey[i + s]), matcher(grey[i + s], grey[i])
-                flows[i, s] = forward, confidence(forward, backward)
-                flows[i + s, -s] = backward, confidence(backward, forward)
-        for i, image in enumerate(images):
-            mine = {s: flows[i, s] for s in signed if (i, s) in flows}
-            builder.add(v, image, (masks[i] * 255).astype(np.uint8), mine, 1.0)
-        k = np.array(truth["K"])
-        poses.append(np.array(truth["object_to_camera"])[: len(images)])
-        intrinsics += [k] * len(images)
-        times = tuple(float(t) for t in np.arange(len(images)) / 20)
-        height, width = images[0].shape[:2]
-        focal, centre = (float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2]))
-        videos.append(VideoFacts(path.stem, times, width, height, focal, centre))
-    return Seen(
-        builder.finish(),
-        torch.from_numpy(np.concatenate(poses)).float(),
-        torch.from_numpy(np.stack(intrinsics)).float(),
-        videos,
+    Raises BadInput when one of them has not, or when frames of a clip were left out.
+    """
+    results = Results(workspace)
+    names = results.videos[:clips]
+    frames, masks, flow, features = (
+        {name: results.folder(stage, name) for name in names} for stage in ("frames", "masks", "flow", "features")
     )
+    found = collect(frames, masks, flow, features, results.folder("poses"), steps, _quiet())
+    for name, clip in found.clips.items():
+        if len(clip) != len(clip.source_time_s):  # meshes are written, and scored, by the number of the frame
+            raise BadInput(f"{name}: {len(clip)} of {len(clip.source_time_s)} frames were kept, all are scored")
+    return Seen(found.observations, found.camera_from_object, found.intrinsics, found.videos)
+
+
+def _quiet() -> Run:
+    """A run that only warns: what a stage would log has no place between the rows of a table."""
+    log = logging.getLogger(f"{__name__}.stage")
+    log.setLevel(logging.WARNING)
+    return Run(log=log)
 
 
 def shaken(poses: Tensor, degrees: float, seed: int) -> Tensor:
@@ -104,44 +90,23 @@ def shaken(poses: Tensor, degrees: float, seed: int) -> Tensor:
     return rigid(poses[:, :3, :3] @ turn, poses[:, :3, 3])
 
 
+def steadied(seen: Seen) -> Seen:
+    """The same with root poses that have lost their jitter, as in the `poses` stage with ``poses.refine = true``."""
+    tracks = [track.double().numpy() for track in seen.poses.split([len(video.time_s) for video in seen.videos])]
+    made, _, _ = steady(tracks, [np.array(video.time_s) for video in seen.videos])
+    return replace(seen, poses=torch.from_numpy(np.concatenate(made)).float())
+
+
 def reconstruct(
     seen: Seen, fit: FitSettings, correct: CorrectSettings, refine: RefineSettings, hold_roots: bool = True
 ) -> tuple[Banmo, float]:
-    """The three phases one after the other; returns the model and the processor seconds that optimisation took."""
-    normal = initialise.normalise(seen.observations, seen.poses, seen.intrinsics)
-    room = None
-    if fit.start == "sphere":
-        generator = torch.Generator().manual_seed(fit.seed)
-        solid = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
-        solid = solid * 0.5 * torch.rand(4000, 1, generator=generator) ** (1 / 3)
-    else:
-        poses, k = normal.camera_from_canonical, seen.intrinsics
-        hull = initialise.rigid_hull(seen.observations, poses, k, HULL_VOXEL)
-        solid, room = hull.nodes[hull.solid], initialise.swept(hull, fit.bones_share)
-    architecture = Architecture(
-        representation=fit.representation,
-        voxel=fit.voxel,
-        mlp_depth=fit.mlp_depth,
-        mlp_width=fit.mlp_width,
-        pose_code=fit.pose_code,
-        octaves=initialise.octaves(seen.videos, fit.motion_period_s),
-        splines=initialise.splines(seen.videos, fit.motion_spacing_s),
-        blending=fit.blending,
-        deformation=fit.deformation,
-    )
-    model = initialise.build(
-        architecture,
-        seen.videos,
-        normal.camera_from_canonical,
-        solid,
-        HULL_VOXEL,
-        fit.bones,
-        fit.seed,
-        fit.margin,
-        room,
-    )
-    if hold_roots:
-        model.root_free.zero_()
+    """The three phases one after the other; returns the model and the processor seconds that optimisation took.
+
+    The first model, and what becomes of a model between phases, are the product's.
+    """
+    held = torch.full((len(seen.videos),), float(hold_roots))
+    collection = Collection(seen.observations, seen.poses, seen.intrinsics, seen.videos, held, [], {})
+    model = _first(collection, initialise.normalise(seen.observations, seen.poses, seen.intrinsics), fit, _quiet())
     start = time.process_time()
     for settings in (fit, correct, refine):
         if settings.iterations == 0:
@@ -150,8 +115,9 @@ def reconstruct(
         while not trainer.done:
             trainer.step()
         model = trainer.model
-        if settings is fit and fit.settle_root and not hold_roots and model.dense is None:
+        if settings is fit and fit.settle_root and model.dense is None:
             settle(model)
+        model = Banmo.restore(model.state_dict(), model.describe())
     return model, time.process_time() - start
 
 
@@ -186,7 +152,10 @@ def judge(evaluate: Path, data: Path, meshes: Path, every: int = 5, clips: int =
     rows = []
     for more in asked:
         command = [sys.executable, str(evaluate), "mesh", "--gt", str(data / "gt" / "meshes.npz")]
-        done = subprocess.run([*command, "--every", str(every), *more], capture_output=True, text=True, check=False)
+        command += ["--every", str(every), *more]
+        # its linear algebra would take every core otherwise
+        alone = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=alone)
         if done.returncode:
             raise RuntimeError(done.stderr.strip() or done.stdout.strip())
         rows.append(read_score(done.stdout))
