@@ -25,11 +25,14 @@ from stages.fitting.observations import Observations
 from stages.model.banmo import Banmo
 
 _SMOOTH_S = 0.25  # seconds over which errors are averaged: a single bad frame is no other reading
+_GAIN_S = 0.5  # ... and over which it is judged which reading is better
 _LEAST_S = 0.3  # shortest stretch that is looked at, and shortest that is taken
+_GAP_S = 0.4  # between two stretches that are looked at as one
+_WEIGHTS = (1.0, 1.0, 0.5)  # silhouette, colour, features: a network may take left for right, too
 _WORSE = 1.08  # of the clip's usual error: from here on a stretch is looked at
 _MOST_SHARE = 0.35  # of a clip that is looked at: beyond that the clip, not the stretch, is at fault
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
-_LEAST_GAIN = 0.04  # of the usual error that the other reading must save
+_LEAST_GAIN = 0.03  # of the usual error that the other reading must save
 _JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit between successive frames
 _POINTS, _MOST_POSES = 160, 400
 
@@ -80,8 +83,9 @@ def _errors(figures: FrameFigures) -> Tensor:
 
 
 def _relative(errors: Tensor, usual: Tensor) -> Tensor:
-    """(T,) mean of errors (T, 3) over what is usual (3,), of those that are known."""
-    return (errors / usual).nanmean(1)
+    """(T,) weighted mean of errors (T, 3) over what is usual (3,), of those that are known; NaN where none is."""
+    weight = torch.tensor(_WEIGHTS) * ~errors.isnan()
+    return ((errors / usual).nan_to_num() * weight).sum(1) / torch.where(weight.any(1), weight.sum(1), torch.nan)
 
 
 def doubtful(error: Tensor, model: Banmo) -> Tensor:
@@ -92,9 +96,10 @@ def doubtful(error: Tensor, model: Banmo) -> Tensor:
         known = ~own.isnan()
         if int(known.sum()) < 8:
             continue
-        smooth = _smoothed(torch.where(known, own, own[known].median()), frames_a_second)
+        smooth = _smoothed(torch.where(known, own, own[known].median()), _SMOOTH_S * frames_a_second)
         limit = max(_WORSE * float(smooth.median()), float(smooth.quantile(1 - _MOST_SHARE)))
-        found[mine] = _long_runs(smooth > limit, frames_a_second)
+        joined = ~_long_runs(smooth <= limit, _GAP_S * frames_a_second)
+        found[mine] = _long_runs(joined, _LEAST_S * frames_a_second)
     return found
 
 
@@ -104,8 +109,10 @@ def better(gain: Tensor, looked_at: Tensor, model: Banmo) -> Tensor:
     for mine, frames_a_second in _clips(model):
         asked = looked_at[mine]
         own = torch.where(asked & ~gain[mine].isnan(), gain[mine], 0.0)
-        kept = (_smoothed(own, frames_a_second) > _LEAST_GAIN) & asked
-        found[mine] = _long_runs(kept, frames_a_second)
+        # Only what was asked about counts: beyond a stretch's ends there is nothing to gain or lose.
+        share = _smoothed(asked.float(), _GAIN_S * frames_a_second).clamp_min(1e-6)
+        kept = (_smoothed(own, _GAIN_S * frames_a_second) / share > _LEAST_GAIN) & asked
+        found[mine] = _long_runs(kept, _LEAST_S * frames_a_second)
     return found
 
 
@@ -156,18 +163,18 @@ def _clips(model: Banmo) -> list[tuple[slice, float]]:
     return found
 
 
-def _smoothed(values: Tensor, frames_a_second: float) -> Tensor:
-    """Moving mean (N,) over `_SMOOTH_S`; the ends are averaged over what there is of them."""
-    width = 2 * round(_SMOOTH_S * frames_a_second / 2) + 1
+def _smoothed(values: Tensor, frames: float) -> Tensor:
+    """Moving mean (N,) over about so many `frames`; the ends are averaged over what there is of them."""
+    width = 2 * round(frames / 2) + 1
     pooled = torch.nn.functional.avg_pool1d(
         values[None, None], width, stride=1, padding=width // 2, count_include_pad=False
     )
     return pooled[0, 0]
 
 
-def _long_runs(flags: Tensor, frames_a_second: float) -> Tensor:
-    """Those of `flags` (N,) that stand in a row for `_LEAST_S` at least."""
-    least = max(3, round(_LEAST_S * frames_a_second))
+def _long_runs(flags: Tensor, frames: float) -> Tensor:
+    """Those of `flags` (N,) of which about so many `frames` at least stand in a row."""
+    least = max(3, round(frames))
     kept = torch.zeros_like(flags)
     start = None
     for i, flag in enumerate([*flags.tolist(), False]):

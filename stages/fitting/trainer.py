@@ -223,7 +223,7 @@ class Trainer:
                 trainer.step()
 
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
-            return frame_figures(model, seen, frame_boxes(model), s, beta)
+            return frame_figures(model, seen, frame_boxes(model), s, beta, pixels=400)
 
         self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, self.team.agree)
         if self.rethought.taken:
