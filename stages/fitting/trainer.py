@@ -210,8 +210,11 @@ class Trainer:
         s = self.settings
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
         quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
+        # Where a pose ends depends on how many steps it makes more than on how many rays each step has.
+        rays = {"frames_per_step": -(-s.frames_per_step // 2), "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
+        steps = max(1, round(3 * s.rethink_share * s.iterations / 2))
         still = replace(
-            s, **quiet, iterations=max(1, round(s.rethink_share * s.iterations / 2)), beta_start=beta, beta_end=beta,
+            s, **quiet, **rays, iterations=steps, beta_start=beta, beta_end=beta,
             cover_from=0.0, spill_from=0.0, decay_from=0.5, warmup_steps=10, active_share=0.0, flow_only_every=0,
             renew_at=2.0, reject_at=2.0, rethink_at=(), delta_from=2.0, seed=s.seed + self.step_idx,
         )  # fmt: skip
