@@ -21,32 +21,41 @@ def change_bones(model: Banmo, bones: Bones, points: Tensor, seed: int, steps: i
 
     Returns the root mean square difference of the two motions over all kept frames (units).
     """
-    every = torch.arange(len(model.time))
     sample = points[torch.randperm(len(points), generator=step_generator(seed, 0, rank=3))[:400]]
-
-    def warp(index: Tensor, some: Tensor) -> Tensor:
-        return model.forward_points(model.frames(index), some[None].expand(len(index), -1, -1))
-
+    target = posed(model, sample)
     with torch.no_grad():
-        target = torch.cat([warp(chunk, sample) for chunk in every.split(64)])
         model.bones.load_state_dict(bones.state_dict())
+    return imitate(model, sample, target, seed, steps)
+
+
+@torch.no_grad()
+def posed(model: Banmo, points: Tensor) -> Tensor:
+    """Canonical points (N, 3) in object space in all T kept frames, (T, N, 3)."""
+    every = torch.arange(len(model.time)).split(64)
+    return torch.cat([model.forward_points(model.frames(i), points[None].expand(len(i), -1, -1)) for i in every])
+
+
+def imitate(model: Banmo, points: Tensor, target: Tensor, seed: int, steps: int = 200) -> float:
+    """Fit the bones' motion so that canonical points (N, 3) go where `target` (T, N, 3) has them.
+
+    Returns the root mean square distance that is left (units).
+    """
     for parameter in model.body.parameters():
         parameter.requires_grad_(True)
     optimiser = torch.optim.Adam(model.body.parameters(), lr=3e-3)
     for step in range(steps):
         generator = step_generator(seed, step, rank=5)
-        index = torch.randint(len(every), (48,), generator=generator)
-        pick = torch.randint(len(sample), (200,), generator=generator)
-        error = (warp(index, sample[pick]) - target[index][:, pick]).square().sum(-1).mean()
+        index = torch.randint(len(target), (48,), generator=generator)
+        pick = torch.randint(len(points), (200,), generator=generator)
+        moved = model.forward_points(model.frames(index), points[pick][None].expand(len(index), -1, -1))
+        error = (moved - target[index][:, pick]).square().sum(-1).mean()
         optimiser.zero_grad(set_to_none=True)
         error.backward()
         for group in optimiser.param_groups:
             group["lr"] = 3e-3 * (1 - 0.9 * step / steps)
         optimiser.step()
     optimiser.zero_grad(set_to_none=True)
-    with torch.no_grad():
-        moved = torch.cat([warp(chunk, sample) for chunk in every.split(64)])
-    return float((moved - target).square().sum(-1).mean().sqrt())
+    return float((posed(model, points) - target).square().sum(-1).mean().sqrt())
 
 
 def renew_bones(model: Banmo, seed: int) -> float:

@@ -22,6 +22,7 @@ from torch import Tensor
 from stages.fitting.diagnose import FrameFigures
 from stages.fitting.known_poses import best_sequence, known_shapes, misfit, spread
 from stages.fitting.observations import Observations
+from stages.fitting.renew import imitate, posed
 from stages.model.banmo import Banmo
 
 _SMOOTH_S = 0.25  # seconds over which errors are averaged: a single bad frame is no other reading
@@ -34,7 +35,7 @@ _MOST_SHARE = 0.35  # of a clip that is looked at: beyond that the clip, not the
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
 _LEAST_GAIN = -0.01  # of the usual error; below zero: where pictures do not tell, a pose seen elsewhere is likelier
 _JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit between successive frames
-_POINTS, _MOST_POSES = 160, 400
+_POINTS, _MOST_POSES, _IMITATED = 160, 400, 400
 
 
 class Rethought(NamedTuple):
@@ -49,9 +50,10 @@ def second_thoughts(
     observations: Observations,
     figures_of: Callable[[Banmo, Observations], FrameFigures],
     practise: Callable[[Banmo, Observations], None],
+    seed: int,
     agree: Callable[[Tensor], Tensor] = lambda tensor: tensor,
 ) -> Rethought:
-    """Change the pose codes of stretches that another reading explains better; everything else stays as it is.
+    """Take up the motion of stretches that another reading explains better; all other motion stays as it is.
 
     Args:
         figures_of: how well a model explains each frame with weight.
@@ -73,7 +75,11 @@ def second_thoughts(
         practise(copy, focus)
     gain = _relative(_errors(figures_of(same, focus)), usual) - _relative(_errors(figures_of(other, focus)), usual)
     taken = agree(better(gain, looked_at, model))
-    redirect(model, torch.where(taken, wanted, -1))
+    if taken.any():
+        points = model.surface[spread(len(model.surface), _IMITATED)]
+        target = torch.where(taken[:, None, None].to(points.device), posed(other, points), posed(model, points))
+        redirect(model, torch.where(taken, wanted, -1))
+        imitate(model, points, target, seed)
     return Rethought(int(looked_at.sum()), int(taken.sum()))
 
 

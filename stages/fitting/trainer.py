@@ -249,7 +249,7 @@ class Trainer:
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
             return frame_figures(model, seen, frame_boxes(model), s, beta, pixels=400)
 
-        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, self.team.agree)
+        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, still.seed, self.team.agree)
         if self.rethought.taken:
             self._agree()
             self.refresh()

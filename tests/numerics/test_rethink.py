@@ -8,6 +8,7 @@ import torch
 from stages.fitting import rethink
 from stages.fitting.diagnose import FrameFigures
 from stages.fitting.observations import Observations
+from stages.fitting.renew import posed
 from stages.fitting.surface import surface_points
 from stages.fitting.trainer import Trainer
 from stages.model.banmo import Banmo, VideoFacts
@@ -85,12 +86,12 @@ def test_a_stretch_is_doubted_but_no_single_frame_and_no_clip_as_a_whole(model: 
     assert not rethink.doubtful(torch.full((2 * FRAMES,), torch.nan), model).any()
 
 
-def test_what_is_gained_briefly_or_barely_is_not_taken(model: Banmo) -> None:
+def test_what_is_gained_briefly_or_lost_is_not_taken(model: Banmo) -> None:
     asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
     asked[:38] = asked[45:75] = True
-    gain = torch.zeros(2 * FRAMES)
+    gain = torch.full((2 * FRAMES,), -0.1)
     gain[10:30] = 0.3
-    gain[50:70] = 0.01
+    gain[50:70] = -0.03
     found = torch.nonzero(rethink.better(gain, asked, model))[:, 0]
     assert set(range(10, 30)) <= set(found.tolist()) <= set(range(4, 36))
     gain[10:30], gain[20] = -0.1, 0.5
@@ -114,7 +115,7 @@ def test_the_other_reading_is_another_pose(model: Banmo) -> None:
 @pytest.mark.parametrize("helps", [True, False])
 def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) -> None:
     """Figures as they would be if some frames' own codes were right, or the other ones."""
-    before = codes(model)
+    before, were = codes(model), posed(model, model.surface)
     known, stretch = observations(2 * FRAMES), slice(10, 22)
     practised = []
 
@@ -130,15 +131,17 @@ def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) ->
         assert some is not model and bool((focus.frame_weight[:5] == 0).all())
         practised.append(some)
 
-    told = rethink.second_thoughts(model, known, figures_of, practise)
+    told = rethink.second_thoughts(model, known, figures_of, practise, seed=0)
     assert len(practised) == 2 and told.looked_at >= 12
-    change = (codes(model) - before).norm(dim=1)
+    change = (posed(model, model.surface) - were).square().sum(-1).mean(-1).sqrt()
     if not helps:
         assert told.taken == 0 and float(change.max()) == 0
         return
     assert told.taken >= 8
-    assert float(change[stretch].mean()) > 5 * float(change[25:].mean())
-    assert float(change[FRAMES:].max()) == 0, "the other clip has a code of its own"
+    assert float(change[stretch].mean()) > 0.08
+    assert float(change[stretch].mean()) > 6 * float(change[25:].mean())
+    wanted = posed(practised[1], model.surface)[14:18]
+    assert float((posed(model, model.surface)[14:18] - wanted).norm(dim=-1).mean()) < 0.03
 
 
 def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene) -> None:
