@@ -115,11 +115,8 @@ def evaluate(
     generator: torch.Generator,
     team: Team = ALONE,
     uncertainty: Uncertainty | None = None,
-    frame_errors: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Every active term of the objective, already weighted; their sum is minimised.
-
-    `frame_errors` (2, T) takes up the sum of this process's rays' errors in each frame, and their number.
 
     In a team each process answers for its frames of the batch: the terms, and their gradients, add up to those of
     one process alone.
@@ -147,10 +144,8 @@ def evaluate(
         add("silhouette", settings.weight_silhouette, losses.silhouette_loss(seen.opacity, batch.mask, weight))
     if settings.weight_rgb:
         add("rgb", settings.weight_rgb, losses.colour_loss(seen.colour, batch.rgb, inside * opacity))
-    error = losses.ray_error(seen.colour, batch.rgb, seen.opacity, batch.mask, inside * opacity).detach()
-    if frame_errors is not None:
-        frame_errors.index_add_(1, batch.frame_idx, torch.stack([error.sum(1), torch.full_like(error, 1).sum(1)]))
     if uncertainty is not None:
+        error = losses.ray_error(seen.colour, batch.rgb, seen.opacity, batch.mask, inside * opacity).detach()
         add("uncertainty", 1.0, (uncertainty.of(model, batch) - error).abs().mean())
     if settings.weight_flow and has_flow:
         moved = transform(partner.camera_from_object, model.forward_points(partner, seen.surface))

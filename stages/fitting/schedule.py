@@ -19,9 +19,6 @@ class PhaseSettings:
 
     frames_per_step: int = 24
     """Frames in a batch."""
-    frame_focus: float = 0.0
-    """Frames are drawn in proportion to this power of their error so far, within half and twice as often as the usual
-    one: fast motion needs more steps than slow. 0 = all alike."""
     pixels_per_frame: int = 112
     """Rays a frame in a batch."""
     edge_share: float = 0.0

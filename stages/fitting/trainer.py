@@ -44,7 +44,6 @@ class Trainer:
         self.step_idx = 0
         self.rate_scale = 1.0
         self.trust = torch.ones(len(observations))
-        self.frame_error = torch.zeros(len(observations))  # running mean of each frame's; 0 = not seen yet
         self.renewal_error: float | None = None  # units; see renew_bones
         self.rethought: Rethought | None = None
         self.pause: Callable[[], None] = lambda: None  # called during long work between two steps; may raise
@@ -136,8 +135,7 @@ class Trainer:
         generator = step_generator(s.seed, self.step_idx)
         batch = self._draw(generator)
         beta = max(beta_at(s, self.progress), model.beta_floor)
-        told = torch.zeros(2, len(self.observations), device=self.device) if s.frame_focus else None
-        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator, self.team, self.uncertainty, told)
+        terms = evaluate(model, self.boxes, batch, s, beta, self.step_idx, generator, self.team, self.uncertainty)
         total = torch.stack(list(terms.values())).sum()
         whole = torch.stack([value.detach() for value in terms.values()])
         self.team.sum([whole])
@@ -153,8 +151,6 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] == "sdf" else group["base"] * rate
             torch.nn.utils.clip_grad_norm_(group["params"], 10.0)
         self.optimiser.step()
-        if told is not None:
-            self._remember(told)
         self.step_idx += 1
         values["total"] = sum(values.values())
         return values
@@ -185,31 +181,14 @@ class Trainer:
     def _trusted(self) -> Observations:
         return replace(self.observations, frame_weight=self.observations.frame_weight * self.trust)
 
-    def _remember(self, told: Tensor) -> None:
-        """Keep a running mean of each frame's error: sums and numbers of rays, (2, T)."""
-        self.team.sum([told])
-        total, rays = told.cpu()
-        new = total / rays.clamp_min(1)
-        kept = torch.where(self.frame_error > 0, 0.8 * self.frame_error + 0.2 * new, new)
-        self.frame_error = torch.where(rays > 0, kept, self.frame_error)
-
-    def _focused(self) -> Observations:
-        """Trusted frames, those with large errors more often."""
-        seen, power = self._trusted(), self.settings.frame_focus
-        known = (self.frame_error > 0) & (seen.frame_weight > 0)
-        if not power or not known.any():
-            return seen
-        error = torch.where(known, self.frame_error / self.frame_error[known].median(), 1.0)
-        return replace(seen, frame_weight=seen.frame_weight * error.pow(power).clamp(0.5, 2.0))
-
     def _draw(self, generator: torch.Generator) -> Batch:
         """The step's batch. Later in the phase some pixels of each frame are the most uncertain of many candidates."""
         s = self.settings
         active = round(s.active_share * s.pixels_per_frame) if self.progress >= s.active_from else 0
         if self.uncertainty is None or not active:
-            return draw(self._focused(), s.frames_per_step, s.pixels_per_frame, generator, s.edge_share).to(self.device)
+            return draw(self._trusted(), s.frames_per_step, s.pixels_per_frame, generator, s.edge_share).to(self.device)
         plain = s.pixels_per_frame - active
-        batch = draw(self._focused(), s.frames_per_step, plain + 4 * active, generator, s.edge_share).to(self.device)
+        batch = draw(self._trusted(), s.frames_per_step, plain + 4 * active, generator, s.edge_share).to(self.device)
         with torch.no_grad():
             expected = self.uncertainty.of(self.model, batch)
         keep = torch.arange(plain, device=self.device).expand(s.frames_per_step, -1)
@@ -264,7 +243,6 @@ class Trainer:
         if self.uncertainty is not None:
             out |= {f"uncertainty.{k}": v.clone() for k, v in self.uncertainty.state_dict().items()}
         out["trust"] = self.trust.clone()
-        out["frame_error"] = self.frame_error.clone()
         out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta), self.settings.iterations])
         out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
         for g, group in enumerate(self.optimiser.param_groups):
@@ -280,7 +258,6 @@ class Trainer:
         self.model.surface = torch.zeros_like(tensors["surface"], device=self.device)
         self.model.load_state_dict(tensors)
         self.trust = state["trust"].cpu().clone()
-        self.frame_error = state["frame_error"].cpu().clone()
         self.boxes = state["boxes"].to(self.device, copy=True)
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])
