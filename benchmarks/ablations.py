@@ -65,7 +65,6 @@ ROWS: dict[str, Row] = {
     "no-spill": Row(fit={"weight_spill": 0.0}),
     "no-splines": Row(fit={"motion_spacing_s": 0.0}),
     "no-second-thoughts": Row(fit={"rethink_at": ()}),
-    "frame-focus": Row(every={"frame_focus": 1.0}),
     "first-bones": Row(fit={"renew_at": 2.0}),
     "not-mended": Row(every={"mend": False}),
     "firm-joints": Row(every={"weight_joints": 0.5}),

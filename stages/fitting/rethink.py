@@ -33,7 +33,7 @@ _WEIGHTS = (1.0, 1.0, 0.5)  # silhouette, colour, features: a network may take l
 _WORSE = 1.08  # of the clip's usual error: from here on a stretch is looked at
 _MOST_SHARE = 0.35  # of a clip that is looked at: beyond that the clip, not the stretch, is at fault
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
-_LEAST_GAIN = -0.01  # of the usual error: where pictures do not tell, a pose seen elsewhere is likelier than one seen only here
+_LEAST_GAIN = -0.01  # of the usual error; below zero: where pictures do not tell, a pose seen elsewhere is likelier
 _JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit between successive frames
 _POINTS, _MOST_POSES, _IMITATED = 160, 400, 400
 
