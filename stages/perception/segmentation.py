@@ -3,9 +3,10 @@
 1. Motion against the background gives each frame sharp but sparse evidence (`background.motion_cues`).
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
-3. The same again on plain colours, leaving the uncertain rim of the mask out of the fit: this tightens the outline.
-4. A network that has learnt to mend rough masks (`refining`) does so at the pictures' own size.
-5. Flicker is voted away along the flow, and the outline is settled at full resolution.
+3. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
+   size. Anything else: the same again on plain colours, leaving the uncertain rim of the mask out of the fit; this
+   tightens the outline.
+4. Flicker is voted away along the flow, and the outline is settled at full resolution.
 """
 
 from __future__ import annotations
@@ -118,13 +119,14 @@ def segment(
     else:
         known = told
     soft = coarse_probability(work, cues, known, carrier, effort)
-    tick(1, 3, "learning")
-    soft = tight_probability(work, soft, cues, known, effort)
-    tick(2, 3, "learning")
+    tick(1, 2, "learning")
     refined = refiner is not None and bool(chosen) and effort.refinements > 0
     if refiner is not None and refined:
+        # Not of a tightened mask: where colours were wrong, that one has lost what the network would have seen.
         soft = refined_probability(images, soft, told, refiner, effort)
-    tick(3, 3, "learning")
+    else:
+        soft = tight_probability(work, soft, cues, known, effort)
+    tick(2, 2, "learning")
     found = finish(images, soft, carrier)
     return Segmentation(found.probability, found.agreement, chosen, refined)
 
@@ -202,7 +204,7 @@ def tight_probability(
 def refined_probability(
     images: np.ndarray, soft: np.ndarray, told: np.ndarray, refiner: RefiningNetwork, effort: Effort
 ) -> np.ndarray:
-    """(T, H, W) probability at the images' own size: the rough one mended, several times over; hints still count."""
+    """(T, H, W) probability at the images' own size: the coarse one mended, several times over; hints still count."""
     height, width = images.shape[1:3]
     found = _resized(soft, width, height)
     hinted = told.any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import pytest
 from pipeline import BadInput, Folder, Given, Interrupted, Run
 from stages.formats import read_clip, read_mask_facts, read_masks
 from stages.masks import MaskSettings, _check, _sheet, masks
+from stages.perception import segmentation
 from stages.perception.appearance import PixelColours
 from stages.perception.background import background_flow, bend_to_surroundings, motion_cues, polynomial_basis
-from stages.perception.segmentation import Effort, Hint, hint_evidence, segment
+from stages.perception.segmentation import Effort, Hint, hint_evidence, segment, tight_probability
 from stages.perception.temporal import area_steadiness, describe, flow_median, main_component, mask_box, touches_border
 from tests.stages.perception_clips import moving_clip, overlap, texture, write_frames_folder
 
@@ -66,6 +68,53 @@ def test_a_still_scene_with_a_box_gives_the_boxed_thing(tmp_path: Path) -> None:
     box = mask_box(TRUTH[0])
     result = segment(still, (Hint(0, box=box),), Effort())
     assert overlap(result.probability > 127, np.repeat(TRUTH[:1], 6, axis=0)) > 0.6
+
+
+class Copier:
+    """A refining network that gives back the rough mask; counts its calls."""
+
+    calls = 0
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        return 20.0 * (inputs[:, 3] - 0.5)
+
+
+@pytest.mark.parametrize(
+    ("known", "refinements", "refined"),
+    [(True, 1, True), (True, 2, True), (True, 0, False), (False, 1, False)],
+    ids=["once", "twice", "never", "no category"],
+)
+def test_outlines_are_tightened_by_colour_where_no_network_does(
+    monkeypatch: pytest.MonkeyPatch, known: bool, refinements: int, refined: bool
+) -> None:
+    tightened: list[bool] = []
+
+    def tight(*inputs: Any) -> np.ndarray:
+        tightened.append(True)
+        return tight_probability(*inputs)
+
+    monkeypatch.setattr(segmentation, "tight_probability", tight)
+    images, truth = IMAGES[:6], TRUTH[:6]
+    priors = {"quadruped": (255 * truth).astype(np.uint8)} if known else {}
+    network = Copier()
+    result = segment(images, effort=Effort(refinements=refinements), priors=priors, refiner=network)
+    assert result.refined == refined and bool(tightened) != refined
+    assert network.calls == (refinements if refined else 0)
+    assert overlap(result.probability > 127, truth) > 0.75
+
+
+def test_hints_count_after_refining() -> None:
+    """A click outside takes a part away that the network would keep."""
+    images, truth = IMAGES[:4], TRUTH[:4]
+    priors = {"quadruped": (255 * truth).astype(np.uint8)}
+    row, column = (int(v.mean()) for v in np.nonzero(truth[2]))
+    hint = Hint(2, outside=np.array([[column + 0.5, row + 0.5]]))
+    plain, told = (
+        segment(images, hints, Effort(), priors=priors, refiner=Copier()).probability[2, row, column]
+        for hints in ((), (hint,))
+    )
+    assert plain > 127 > told
 
 
 def test_hints_are_put_where_they_say() -> None:
