@@ -16,7 +16,7 @@ from stages.geometry.cameras import pixel_directions, project, ray_box, transfor
 from stages.geometry.rotations import so3_log
 from stages.model import losses, rendering
 from stages.model.banmo import Banmo, FrameState
-from stages.model.correspondence import match_grid, soft_argmax
+from stages.model.correspondence import soft_argmax
 from stages.model.fields import GridField
 
 _PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
@@ -238,14 +238,7 @@ def _correspondence(
     frames, count = batch.mask.shape
     per_frame = max(1, settings.match_pixels // draws.frames)
     pick = draws.below(count, per_frame)
-    surface = model.surface
-    low, high = surface.amin(0), surface.amax(0)
-    grid = match_grid(torch.stack([low, high]))
-    # Cells away from the surface carry no mass, as the paper's trained embeddings would make them.
-    gap = torch.cdist(grid, surface[:: max(1, len(surface) // 512)]).amin(1)
-    cell = (high - low).max() / 20
-    keep = gap < 1.5 * cell
-    grid = grid[keep]
+    grid = model.match_cells()
     with torch.no_grad():
         grid_features = model.field.embedding(grid)
     features = batch.features.gather(1, pick[..., None].expand(-1, -1, 16)).reshape(-1, 16)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from stages.geometry.rotations import interpolate_rigid, invert_rigid
+from stages.model.correspondence import cells_near
 from stages.model.dense import DenseWarp
 from stages.model.fields import GridField, MlpField
 from stages.model.motion import BodyPose, FourierCode, RootPose
@@ -120,6 +121,7 @@ class Banmo(nn.Module):
         self.register_buffer("base_poses", base_poses.clone().float())
         self.register_buffer("gauge", torch.eye(4).repeat(len(base_poses), 1, 1))  # see stages.fitting.gauge
         self.register_buffer("surface", torch.zeros(0, 3))
+        self._cells = (torch.zeros(0, 3), 0, torch.zeros(0, 3))  # see match_cells
         self.register_buffer("root_free", torch.ones(count))  # 0 holds a video's root poses where they were given
 
         # Kept as plain tensors, rebuilt from `videos`: times in seconds need float64 to stay exact on disk.
@@ -200,6 +202,16 @@ class Banmo(nn.Module):
         rest = self.delta(points, torch.zeros_like(state.code)) if self.use_delta else None
         weights = skinning_weights(points, state.rest_coefficients.expand(len(points), -1, -1), rest)
         return self._blend(points, weights, state.transforms)
+
+    # ------------------------------------------------------------------------------------------ matching
+
+    def match_cells(self) -> Tensor:
+        """Cells (C, 3) of canonical space that pixels are matched to (equation 10); worked out once a surface."""
+        surface, version, cells = self._cells
+        if surface is not self.surface or version != self.surface._version:
+            cells = cells_near(self.surface)
+            self._cells = (self.surface, self.surface._version, cells)
+        return cells
 
     # ------------------------------------------------------------------------------------------ reading a model
 

@@ -14,6 +14,17 @@ def match_grid(bounds: Tensor, per_axis: int = 20) -> Tensor:
     return torch.stack([x, y, z], -1).reshape(-1, 3)
 
 
+def cells_near(surface: Tensor, per_axis: int = 20) -> Tensor:
+    """Cells (C, 3) of the canonical grid over the box of `surface` (N, 3) that lie on it, to a cell and a half.
+
+    Cells away from the surface carry no mass, as the paper's trained embeddings would make them.
+    """
+    low, high = surface.amin(0), surface.amax(0)
+    grid = match_grid(torch.stack([low, high]), per_axis)
+    gap = torch.cdist(grid, surface[:: max(1, len(surface) // 512)]).amin(1)
+    return grid[gap < 1.5 * (high - low).max() / per_axis]
+
+
 def soft_argmax(
     pixel_features: Tensor, grid: Tensor, grid_features: Tensor, temperature: Tensor | float, prior: Tensor | None
 ) -> Tensor:

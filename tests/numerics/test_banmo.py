@@ -243,3 +243,16 @@ def test_frame_boxes_hold_the_posed_surface(seen: Scene) -> None:
     shift = torch.tensor([0.5, 0, -0.2])
     assert torch.allclose(moved.mean(1), shift.expand(6, 3), atol=0.03)
     assert torch.allclose(so3_exp(torch.tensor([0, 2.0, 0])), model.frames(torch.tensor([0])).transforms[0, 0, :3, :3])
+
+
+def test_cells_to_match_follow_the_surface(seen: Scene) -> None:
+    model = model_of(seen, lambda x: x.norm(dim=-1) - 0.5)
+    first = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    model.surface = first
+    cells = model.match_cells()
+    assert model.match_cells() is cells
+    assert 0.8 < float(cells.norm(dim=1).mean()) < 1.1 and len(cells) < 8000 / 2
+    model.surface = 2 * first
+    assert torch.allclose(model.match_cells(), 2 * cells, atol=1e-5)
+    model.surface.mul_(0.5)  # as load_state_dict does
+    assert torch.allclose(model.match_cells(), cells, atol=1e-5)
