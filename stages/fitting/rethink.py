@@ -50,6 +50,7 @@ def second_thoughts(
     observations: Observations,
     figures_of: Callable[[Banmo, Observations], FrameFigures],
     practise: Callable[[Banmo, Observations], None],
+    most: int,
     seed: int,
     agree: Callable[[Tensor], Tensor] = lambda tensor: tensor,
 ) -> Rethought:
@@ -58,13 +59,14 @@ def second_thoughts(
     Args:
         figures_of: how well a model explains each frame with weight.
         practise: fits the motion of a model, and nothing else, to the frames with weight; the same effort each time.
+        most: frames for which that effort suffices; stretches that are explained worst come first.
         agree: makes processes that share the work decide alike (see :mod:`stages.fitting.team`).
     """
     before = _errors(figures_of(model, observations))
     usual = before.nanmedian(0).values.clamp_min(1e-4)
     found = _relative(before, usual)
     other = deepcopy(model)
-    wanted = agree(other_reading(model, observations, doubtful(found, model)))
+    wanted = agree(other_reading(model, observations, worst(doubtful(found, model), found, model, most)))
     looked_at = wanted >= 0
     if not looked_at.any():
         return Rethought(0, 0)
@@ -74,7 +76,7 @@ def second_thoughts(
     for copy in (same, other):
         practise(copy, focus)
     gain = _relative(_errors(figures_of(same, focus)), usual) - _relative(_errors(figures_of(other, focus)), usual)
-    taken = agree(better(gain, looked_at, model))
+    taken = agree(better(gain, looked_at, model).long()) > 0
     if taken.any():
         points = model.surface[spread(len(model.surface), _IMITATED)]
         target = torch.where(taken[:, None, None].to(points.device), posed(other, points), posed(model, points))
@@ -107,6 +109,16 @@ def doubtful(error: Tensor, model: Banmo) -> Tensor:
         joined = ~_long_runs(smooth <= limit, _GAP_S * frames_a_second)
         found[mine] = _long_runs(joined, _LEAST_S * frames_a_second)
     return found
+
+
+def worst(frames: Tensor, error: Tensor, model: Banmo, most: int) -> Tensor:
+    """Of the stretches in `frames` (T,) those with the largest mean error (T,), about `most` frames in all, as (T,)."""
+    stretches = _runs(torch.nonzero(frames)[:, 0], model)
+    kept = torch.zeros_like(frames)
+    for stretch in sorted(stretches, key=lambda some: -float(error[some].nanmean())):
+        if int(kept.sum()) + len(stretch) <= most or not kept.any():
+            kept[stretch[:most]] = True
+    return kept
 
 
 def better(gain: Tensor, looked_at: Tensor, model: Banmo) -> Tensor:
@@ -196,4 +208,4 @@ def _runs(frames: Tensor, model: Banmo) -> list[Tensor]:
     """Frame indices (N,), sorted, cut wherever one is missing or another clip begins."""
     video = model.video_idx.cpu()[frames]
     cut = torch.nonzero((frames[1:] != frames[:-1] + 1) | (video[1:] != video[:-1]))[:, 0] + 1
-    return list(torch.tensor_split(frames, cut))
+    return [part for part in torch.tensor_split(frames, cut) if len(part)]

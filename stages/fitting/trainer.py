@@ -27,6 +27,9 @@ from stages.fitting.surface import frame_boxes, surface_points
 from stages.fitting.team import ALONE, Team
 from stages.model.banmo import Banmo
 
+_PRACTISED = 40
+"""How often a frame is drawn at least while another reading of it is fitted."""
+
 
 class Diverged(RuntimeError):
     """The objective is not finite any more; `term` names the loss that broke first."""
@@ -211,7 +214,8 @@ class Trainer:
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
         quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
         # Where a pose ends depends on how many steps it makes more than on how many rays each step has.
-        rays = {"frames_per_step": -(-s.frames_per_step // 2), "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
+        few = max(self.team.size, -(-s.frames_per_step // 2))
+        rays = {"frames_per_step": few, "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
         steps = max(1, round(3 * s.rethink_share * s.iterations / 2))
         still = replace(
             s, **quiet, **rays, iterations=steps, beta_start=beta, beta_end=beta,
@@ -228,7 +232,11 @@ class Trainer:
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
             return frame_figures(model, seen, frame_boxes(model), s, beta, pixels=400)
 
-        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, still.seed, self.team.agree)
+        def agree(told: Tensor) -> Tensor:
+            return self.team.agree(told.to(self.device)).cpu()
+
+        most = steps * few // _PRACTISED
+        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, most, still.seed, agree)
         if self.rethought.taken:
             self._agree()
             self.refresh()

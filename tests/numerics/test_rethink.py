@@ -112,6 +112,18 @@ def test_the_other_reading_is_another_pose(model: Banmo) -> None:
     assert (rethink.other_reading(model, known, asked) < 0).all()
 
 
+def test_the_worst_stretches_come_first_if_there_is_no_time_for_all(model: Banmo) -> None:
+    asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
+    asked[5:15] = asked[30:50] = asked[60:68] = True  # the second runs on into the other clip
+    error = torch.ones(2 * FRAMES)
+    error[60:68], error[30:40], error[40:50] = 3.0, 2.0, 1.5
+    kept = rethink.worst(asked, error, model, most=20)
+    assert torch.nonzero(kept)[:, 0].tolist() == [*range(30, 40), *range(60, 68)]
+    assert torch.equal(rethink.worst(asked, error, model, most=99), asked)
+    assert rethink.worst(asked, error, model, most=4).sum() == 4
+    assert not rethink.worst(torch.zeros_like(asked), error, model, most=99).any()
+
+
 @pytest.mark.parametrize("helps", [True, False])
 def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) -> None:
     """Figures as they would be if some frames' own codes were right, or the other ones."""
@@ -131,7 +143,7 @@ def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) ->
         assert some is not model and bool((focus.frame_weight[:5] == 0).all())
         practised.append(some)
 
-    told = rethink.second_thoughts(model, known, figures_of, practise, seed=0)
+    told = rethink.second_thoughts(model, known, figures_of, practise, most=40, seed=0)
     assert len(practised) == 2 and told.looked_at >= 12
     change = (posed(model, model.surface) - were).square().sum(-1).mean(-1).sqrt()
     if not helps:

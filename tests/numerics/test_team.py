@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import socket
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import torch
 from pipeline import BadInput, Interrupted, Run
 from stages import phases
 from stages.checkpoint import Checkpoints
+from stages.fitting import rethink
+from stages.fitting import trainer as training
 from stages.fitting.batches import Draws, draw, step_generator
 from stages.fitting.team import ALONE, Team, joined
 from stages.fitting.trainer import Diverged, Trainer
@@ -37,6 +40,17 @@ def train(team: Team) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
     trainer = Trainer(first_model(), scene(sphere(0.5), frames=4).observations, SETTINGS, team)
     values = [trainer.step() for _ in range(STEPS)]
     return values, trainer.state()
+
+
+def think(team: Team) -> tuple[list[int], dict[str, torch.Tensor]]:
+    """Second thoughts about every frame, whatever the poses are."""
+    rethink.doubtful = lambda error, model: torch.ones(len(error), dtype=torch.bool)  # type: ignore[assignment]
+    rethink._APART, rethink._LEAST_GAIN, training._PRACTISED = 1e-4, -9.0, 1
+    settings = replace(SETTINGS, rethink_share=0.6)
+    trainer = Trainer(first_model(), scene(sphere(0.5), frames=4).observations, settings, team)
+    trainer._rethink()
+    assert trainer.rethought is not None
+    return list(trainer.rethought), trainer.state()
 
 
 def phase(rank: int, size: int, folder: Path, stop_at: int | None) -> str:
@@ -80,6 +94,7 @@ def member(rank: int, size: int, ports: list[int], folder: str) -> None:
     phases._write_preview = lambda *_: None  # type: ignore[assignment]
     with joined(rank, size, "cpu", PATIENCE_S) as team:
         values, state = train(team)
+        thoughts, state_after = think(team)
         mixed = [float(rank), 1.0]
         tensors = [torch.tensor(mixed), torch.full((2, 2), 2.0 * rank)]
         team.sum(tensors)
@@ -90,7 +105,16 @@ def member(rank: int, size: int, ports: list[int], folder: str) -> None:
         meet(port)
         outcomes.append(phase(rank, size, Path(folder), stop_at))
     torch.save(
-        {"values": values, "state": state, "sums": tensors, "agreed": agreed, "flags": flags, "outcomes": outcomes},
+        {
+            "values": values,
+            "state": state,
+            "thoughts": thoughts,
+            "state_after": state_after,
+            "sums": tensors,
+            "agreed": agreed,
+            "flags": flags,
+            "outcomes": outcomes,
+        },
         f"{folder}/rank{rank}.pt",
     )
 
@@ -131,6 +155,15 @@ def test_two_processes_lose_what_one_loses(members: list[dict[str, Any]]) -> Non
         assert torch.equal(members[0]["state"][name], members[1]["state"][name]), name
     for name in ("model.field.sdf_grids.0", "model.body.head.out.weight", "model.bones.centres", "boxes"):
         assert torch.allclose(members[0]["state"][name], state[name], atol=2e-3), name
+
+
+def test_two_processes_think_alike(members: list[dict[str, Any]]) -> None:
+    first, second = members
+    assert first["thoughts"] == second["thoughts"]
+    looked_at, taken = first["thoughts"]
+    assert looked_at >= 4 and taken >= 3
+    for name, value in first["state_after"].items():
+        assert torch.equal(value, second["state_after"][name]), name
 
 
 def test_messages_of_a_team(members: list[dict[str, Any]]) -> None:
