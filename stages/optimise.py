@@ -62,7 +62,7 @@ class FitSettings(PhaseSettings):
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     rethink_at: tuple[float, ...] = (0.45, 0.7)
     """Shares of the phase at which stretches of motion that are explained badly are read anew: poses of other frames
-    are fitted there, too, and taken where they explain the pictures better; empty = never."""
+    are fitted there, too, and taken where they explain the pictures better; empty = never, as are 0 and 1."""
     motion_period_s: float = 0.25
     """Fastest motion that the pose codes can follow."""
     motion_spacing_s: float = 0.1

@@ -57,6 +57,9 @@ def run_phase(
     if not team.leads:
         return
     model = trainer.model
+    if settings.rethink_at:
+        for name, count in zip(("frames_doubted", "frames_reread"), trainer.reread.tolist(), strict=True):
+            run.metric(name, count)
     if diagnose:
         _diagnose(trainer, collection, out, run)
     if settle_root and model.dense is None:
@@ -99,7 +102,7 @@ def _train(
         trainer.settings = settings
         run.metric("steps", settings.iterations)
     team.wait()  # until all have read the same checkpoint
-    setbacks, reread = 0, (0, 0)
+    setbacks = 0
 
     def save() -> None:
         if team.leads:
@@ -139,11 +142,7 @@ def _train(
             run.metric("renewed_bones_rms", round(trainer.renewal_error, 5))
             trainer.renewal_error = None
         if trainer.rethought is not None:
-            looked_at, taken = trainer.rethought
-            run.log.info("second thoughts: %d frames looked at, %d read anew", looked_at, taken)
-            reread = (reread[0] + looked_at, reread[1] + taken)
-            run.metric("frames_doubted", reread[0])
-            run.metric("frames_reread", reread[1])
+            run.log.info("second thoughts: %d frames looked at, %d read anew, %.4f units off (rms)", *trainer.rethought)
             trainer.rethought = None
         if trainer.step_idx % _METRIC_STEPS == 0 or trainer.done:
             history.append({"step": trainer.step_idx, **{k: round(v, 7) for k, v in values.items()}})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from copy import deepcopy
+from dataclasses import replace
 
 from stages.fitting.trainer import Trainer
 
@@ -17,10 +18,12 @@ def affordable_steps(trainer: Trainer, minutes: float, tries: int = 6) -> int:
     In a team every process takes part, as a step needs all of them; their answers differ a little.
     """
     model = deepcopy(trainer.model)
-    trial = Trainer(model, trainer.observations, trainer.settings, trainer.team)
+    settings = trainer.settings
+    trial = Trainer(model, trainer.observations, replace(settings, rethink_at=()), trainer.team)
     trial.step()  # the first one also warms caches
     start = time.perf_counter()
     for _ in range(tries):
         trial.step()
     each = (time.perf_counter() - start) / tries
+    each *= 1 + settings.rethink_share * len({at for at in settings.rethink_at if 0 < at < 1})
     return max(_LEAST, min(_MOST, round(minutes * 60 * (1 - _OVERHEAD) / each)))

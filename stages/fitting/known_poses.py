@@ -63,6 +63,8 @@ def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Obse
             continue
         scale = float(observations.silhouette_scale[frame])
         outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
+        if len(wanted) == 0:  # too small to be seen at the size of the silhouettes
+            continue
         placed = transform(poses[t], shapes.reshape(-1, 3))
         pixels = project(intrinsics[t], placed).reshape(*shapes.shape[:2], 2) * scale
         height, width = outside.shape

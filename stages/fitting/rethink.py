@@ -32,6 +32,7 @@ _GAP_S = 0.4  # between two stretches that are looked at as one
 _WEIGHTS = (1.0, 1.0, 0.5)  # silhouette, colour, features: a network may take left for right, too
 _WORSE = 1.08  # of the clip's usual error: from here on a stretch is looked at
 _MOST_SHARE = 0.35  # of a clip that is looked at: beyond that the clip, not the stretch, is at fault
+_ONE_FRAME = 1.5  # of its clip's usual error: what a single frame can say at most
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
 _LEAST_GAIN = -0.01  # of the usual error; below zero: where pictures do not tell, a pose seen elsewhere is likelier
 _JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit between successive frames
@@ -43,6 +44,7 @@ class Rethought(NamedTuple):
 
     looked_at: int
     taken: int
+    left: float  # units (root mean square): how far the motion is from the one that was chosen
 
 
 def second_thoughts(
@@ -54,7 +56,7 @@ def second_thoughts(
     seed: int,
     agree: Callable[[Tensor], Tensor] = lambda tensor: tensor,
 ) -> Rethought:
-    """Take up the motion of stretches that another reading explains better; all other motion stays as it is.
+    """Take up the motion of stretches that another reading explains better, and hold all other motion.
 
     Args:
         figures_of: how well a model explains each frame with weight.
@@ -69,7 +71,7 @@ def second_thoughts(
     wanted = agree(other_reading(model, observations, worst(doubtful(found, model), found, model, most)))
     looked_at = wanted >= 0
     if not looked_at.any():
-        return Rethought(0, 0)
+        return Rethought(0, 0, 0.0)
     focus = replace(observations, frame_weight=observations.frame_weight * looked_at)
     redirect(other, wanted)
     same = deepcopy(model)
@@ -77,12 +79,13 @@ def second_thoughts(
         practise(copy, focus)
     gain = _relative(_errors(figures_of(same, focus)), usual) - _relative(_errors(figures_of(other, focus)), usual)
     taken = agree(better(gain, looked_at, model).long()) > 0
+    left = 0.0
     if taken.any():
         points = model.surface[spread(len(model.surface), _IMITATED)]
         target = torch.where(taken[:, None, None].to(points.device), posed(other, points), posed(model, points))
         redirect(model, torch.where(taken, wanted, -1))
-        imitate(model, points, target, seed)
-    return Rethought(int(looked_at.sum()), int(taken.sum()))
+        left = imitate(model, points, target, seed, steps=max(200, len(target) // 12))
+    return Rethought(int(looked_at.sum()), int(taken.sum()), left)
 
 
 def _errors(figures: FrameFigures) -> Tensor:
@@ -92,8 +95,9 @@ def _errors(figures: FrameFigures) -> Tensor:
 
 def _relative(errors: Tensor, usual: Tensor) -> Tensor:
     """(T,) weighted mean of errors (T, 3) over what is usual (3,), of those that are known; NaN where none is."""
-    weight = torch.tensor(_WEIGHTS) * ~errors.isnan()
-    return ((errors / usual).nan_to_num() * weight).sum(1) / torch.where(weight.any(1), weight.sum(1), torch.nan)
+    ratio = errors / usual
+    weight = torch.tensor(_WEIGHTS) * ~ratio.isnan()
+    return (ratio.nan_to_num() * weight).sum(1) / torch.where(weight.any(1), weight.sum(1), torch.nan)
 
 
 def doubtful(error: Tensor, model: Banmo) -> Tensor:
@@ -104,10 +108,15 @@ def doubtful(error: Tensor, model: Banmo) -> Tensor:
         known = ~own.isnan()
         if int(known.sum()) < 8:
             continue
-        smooth = _smoothed(torch.where(known, own, own[known].median()), _SMOOTH_S * frames_a_second)
-        limit = max(_WORSE * float(smooth.median()), float(smooth.quantile(1 - _MOST_SHARE)))
-        joined = ~_long_runs(smooth <= limit, _GAP_S * frames_a_second)
-        found[mine] = _long_runs(joined, _LEAST_S * frames_a_second)
+        usual = own[known].median()
+        # However bad one frame is, it says no more than a bad stretch does.
+        told = torch.where(known, own.clamp_max(_ONE_FRAME * usual), 0.0)
+        window = _window(_SMOOTH_S * frames_a_second)
+        share = _smoothed(known.float(), window)
+        smooth = torch.where(share > 0, _smoothed(told, window) / share.clamp_min(1e-6), usual)
+        bad = smooth > max(_WORSE * float(smooth.median()), float(smooth.quantile(1 - _MOST_SHARE)))
+        joined = bad | (_between(bad) & ~_long_runs(~bad, _GAP_S * frames_a_second))
+        found[mine] = _long_runs(joined, max(_LEAST_S * frames_a_second, window + 1))
     return found
 
 
@@ -125,11 +134,12 @@ def better(gain: Tensor, looked_at: Tensor, model: Banmo) -> Tensor:
     """Frames (T,) of stretches long enough whose gain (T,) is large enough, of those that were looked at (T,)."""
     found = torch.zeros(len(gain), dtype=torch.bool)
     for mine, frames_a_second in _clips(model):
-        asked = looked_at[mine]
-        own = torch.where(asked & ~gain[mine].isnan(), gain[mine], 0.0)
-        # Only what was asked about counts: beyond a stretch's ends there is nothing to gain or lose.
-        share = _smoothed(asked.float(), _GAIN_S * frames_a_second).clamp_min(1e-6)
-        kept = (_smoothed(own, _GAIN_S * frames_a_second) / share > _LEAST_GAIN) & asked
+        known = looked_at[mine] & ~gain[mine].isnan()
+        # Only what is known counts: beyond a stretch's ends there is nothing to gain or lose.
+        window = _window(_GAIN_S * frames_a_second)
+        share = _smoothed(known.float(), window)
+        smooth = _smoothed(torch.where(known, gain[mine], 0.0), window) / share.clamp_min(1e-6)
+        kept = (share > 0) & (smooth > _LEAST_GAIN) & looked_at[mine]
         found[mine] = _long_runs(kept, _LEAST_S * frames_a_second)
     return found
 
@@ -144,13 +154,16 @@ def other_reading(model: Banmo, observations: Observations, frames: Tensor) -> T
     asked = torch.nonzero(frames & (observations.frame_weight > 0))[:, 0]
     if len(asked) == 0 or len(model.surface) == 0:
         return wanted
-    known = spread(len(model.time), _MOST_POSES)
+    seen = torch.nonzero(observations.frame_weight > 0)[:, 0]
+    known = seen[spread(len(seen), _MOST_POSES)]
     points = model.surface[spread(len(model.surface), _POINTS)]
     shapes = known_shapes(model, known, points).cpu()
     jump = _JUMP * torch.stack([(shapes - shape).norm(dim=-1).mean(-1) for shape in shapes])
     for stretch in _runs(asked, model):
-        state = model.frames(stretch)
-        cost = misfit(shapes, state.camera_from_object.cpu(), state.intrinsics.cpu(), observations, stretch)
+        states = [model.frames(part) for part in stretch.split(64)]
+        poses = torch.cat([state.camera_from_object for state in states]) @ model.gauge[stretch]
+        intrinsics = torch.cat([state.intrinsics for state in states])
+        cost = misfit(shapes, poses.cpu(), intrinsics.cpu(), observations, stretch)
         now = known_shapes(model, stretch, points).cpu()
         apart = torch.stack([(shapes - shape).square().sum(-1).mean(-1).sqrt() for shape in now])
         cost[apart < _APART] = torch.inf
@@ -164,7 +177,8 @@ def other_reading(model: Banmo, observations: Observations, frames: Tensor) -> T
 def redirect(model: Banmo, wanted: Tensor, ridge: float = 1e-3) -> None:
     """Give frames the pose codes of others: frame t that of frame ``wanted[t]`` (T,); where it is -1, its own."""
     wanted = wanted.to(model.time.device)
-    codes = model.body.code(model.video_idx, model.time)
+    every = torch.arange(len(model.time), device=model.time.device).split(64)
+    codes = torch.cat([model.body.code(model.video_idx[some], model.time[some]) for some in every])
     change = torch.where((wanted >= 0)[:, None], codes[wanted.clamp_min(0)] - codes, 0.0)
     for video in range(len(model.videos)):
         mine = slice(model.starts[video], model.starts[video + 1])
@@ -181,9 +195,18 @@ def _clips(model: Banmo) -> list[tuple[slice, float]]:
     return found
 
 
-def _smoothed(values: Tensor, frames: float) -> Tensor:
-    """Moving mean (N,) over about so many `frames`; the ends are averaged over what there is of them."""
-    width = 2 * round(frames / 2) + 1
+def _window(frames: float) -> int:
+    """An odd number of frames, about so many."""
+    return 2 * round(frames / 2) + 1
+
+
+def _between(flags: Tensor) -> Tensor:
+    """From the first to the last that is set of `flags` (N,)."""
+    return (flags.cumsum(0) > 0) & (flags.flip(0).cumsum(0).flip(0) > 0)
+
+
+def _smoothed(values: Tensor, width: int) -> Tensor:
+    """Moving mean (N,) over `width` frames, odd; the ends are averaged over what there is of them."""
     pooled = torch.nn.functional.avg_pool1d(
         values[None, None], width, stride=1, padding=width // 2, count_include_pad=False
     )

@@ -49,6 +49,7 @@ class Trainer:
         self.trust = torch.ones(len(observations))
         self.renewal_error: float | None = None  # units; see renew_bones
         self.rethought: Rethought | None = None
+        self.reread = torch.zeros(2, dtype=torch.int64)  # frames looked at and read anew so far
         self.pause: Callable[[], None] = lambda: None  # called during long work between two steps; may raise
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
@@ -209,8 +210,10 @@ class Trainer:
         self.optimiser = self._optimiser()
 
     def _rethink(self) -> None:
-        """Other readings of what is explained badly; the motion's step sizes are learned anew where one is taken."""
+        """Other readings of what is explained badly; the motion's moments start afresh where one is taken."""
         s = self.settings
+        if s.lr_motion <= 0:
+            return
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
         quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
         # Where a pose ends depends on how many steps it makes more than on how many rays each step has.
@@ -225,22 +228,30 @@ class Trainer:
 
         def practise(model: Banmo, seen: Observations) -> None:
             trainer = Trainer(model, seen, still, self.team)
+            trainer.rate_scale = self.rate_scale
             while not trainer.done:
                 self.pause()
                 trainer.step()
 
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
+            self.pause()
             return frame_figures(model, seen, frame_boxes(model), s, beta, pixels=400)
 
         def agree(told: Tensor) -> Tensor:
             return self.team.agree(told.to(self.device)).cpu()
 
         most = steps * few // _PRACTISED
-        self.rethought = second_thoughts(self.model, self._trusted(), figures_of, practise, most, still.seed, agree)
-        if self.rethought.taken:
+        try:
+            told = second_thoughts(self.model, self._trusted(), figures_of, practise, most, still.seed, agree)
+        except Diverged:  # a copy did, in every process alike: the model itself is as it was
+            told = Rethought(0, 0, 0.0)
+        self.rethought = told
+        self.reread += torch.tensor([told.looked_at, told.taken])
+        if told.taken:
             self._agree()
             self.refresh()
-            self.optimiser = self._optimiser()
+            for parameter in self.groups()["motion"][0]:
+                self.optimiser.state.pop(parameter, None)
 
     # ------------------------------------------------------------------------------------------ state
 
@@ -251,6 +262,7 @@ class Trainer:
         if self.uncertainty is not None:
             out |= {f"uncertainty.{k}": v.clone() for k, v in self.uncertainty.state_dict().items()}
         out["trust"] = self.trust.clone()
+        out["reread"] = self.reread.clone()
         out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta), self.settings.iterations])
         out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
         for g, group in enumerate(self.optimiser.param_groups):
@@ -266,6 +278,7 @@ class Trainer:
         self.model.surface = torch.zeros_like(tensors["surface"], device=self.device)
         self.model.load_state_dict(tensors)
         self.trust = state["trust"].cpu().clone()
+        self.reread = state["reread"].cpu().clone()
         self.boxes = state["boxes"].to(self.device, copy=True)
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])

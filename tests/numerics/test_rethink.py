@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from stages.fitting import rethink
+from stages.fitting import rethink, trainer
 from stages.fitting.diagnose import FrameFigures
 from stages.fitting.observations import Observations
 from stages.fitting.renew import posed
 from stages.fitting.surface import surface_points
 from stages.fitting.trainer import Trainer
+from stages.geometry.rotations import rigid, so3_exp
 from stages.model.banmo import Banmo, VideoFacts
 from stages.model.motion import FourierCode
 from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, orbit, scene, stir, tiny_settings
@@ -33,11 +34,13 @@ def solid(points: torch.Tensor) -> torch.Tensor:
 @pytest.fixture
 def model(seen: Scene) -> Banmo:
     """Two clips of 40 frames, 20 a second, of a body that moves."""
+    return moving(seen, 20.0)
+
+
+def moving(seen: Scene, frames_a_second: float) -> Banmo:
     found = model_of(seen, solid)
-    videos = [
-        VideoFacts(f"clip{v}", tuple(0.05 * i for i in range(FRAMES)), 48, 40, (44.0, 44.0), (24.0, 20.0))
-        for v in range(2)
-    ]
+    times = tuple(i / frames_a_second for i in range(FRAMES))
+    videos = [VideoFacts(f"clip{v}", times, 48, 40, (44.0, 44.0), (24.0, 20.0)) for v in range(2)]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         generator = torch.Generator().manual_seed(0)
@@ -86,6 +89,33 @@ def test_a_stretch_is_doubted_but_no_single_frame_and_no_clip_as_a_whole(model: 
     assert not rethink.doubtful(torch.full((2 * FRAMES,), torch.nan), model).any()
 
 
+@pytest.mark.parametrize("frames_a_second", [6.0, 10.0, 15.0, 20.0, 24.0, 30.0, 60.0])
+def test_one_bad_frame_and_even_errors_are_no_other_reading(seen: Scene, frames_a_second: float) -> None:
+    model = moving(seen, frames_a_second)
+    error = torch.ones(2 * FRAMES)
+    assert not rethink.doubtful(error, model).any()
+    error[12] = error[FRAMES + 30] = 3.0
+    assert not rethink.doubtful(error, model).any()
+    error[:8] = torch.nan
+    assert not rethink.doubtful(error, model).any()
+
+
+def test_what_was_not_looked_at_says_nothing(model: Banmo) -> None:
+    """Of long collections only some frames are compared: the others neither gain nor dilute."""
+    error, asked = torch.full((2 * FRAMES,), torch.nan), torch.zeros(2 * FRAMES, dtype=torch.bool)
+    error[::3] = 1.0
+    error[12:24:3] = 1.5
+    found = torch.nonzero(rethink.doubtful(error, model))[:, 0]
+    assert set(range(12, 21)) <= set(found.tolist()) <= set(range(8, 28))
+    asked[10:30] = True
+    gain = torch.full((2 * FRAMES,), torch.nan)
+    assert not rethink.better(gain, asked, model).any()
+    gain[10:30:4] = -0.2
+    assert not rethink.better(gain, asked, model).any()
+    gain[10:30:4] = 0.2
+    assert torch.equal(rethink.better(gain, asked, model), asked)
+
+
 def test_what_is_gained_briefly_or_lost_is_not_taken(model: Banmo) -> None:
     asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
     asked[:38] = asked[45:75] = True
@@ -108,6 +138,15 @@ def test_the_other_reading_is_another_pose(model: Banmo) -> None:
     shapes = rethink.known_shapes(model, torch.arange(2 * FRAMES), points)
     apart = (shapes[wanted[asked]] - shapes[asked]).square().sum(-1).mean(-1).sqrt()
     assert float(apart.min()) > 0.9 * rethink._APART
+    wide = known.silhouettes.clone()
+    known.silhouettes[:, :, :20] = 0  # something to choose by
+    wanted = rethink.other_reading(model, known, asked)
+    turn = so3_exp(torch.randn(2 * FRAMES, 3, generator=torch.Generator().manual_seed(2)))
+    model.gauge.copy_(rigid(turn, torch.zeros(2 * FRAMES, 3)))  # no picture tells root from bones
+    assert torch.equal(rethink.other_reading(model, known, asked), wanted)
+    known.silhouettes = wide
+    known.frame_weight[wanted[asked].unique()] = 0
+    assert known.frame_weight[rethink.other_reading(model, known, asked)[asked & (known.frame_weight > 0)]].all()
     known.frame_weight[:] = 0
     assert (rethink.other_reading(model, known, asked) < 0).all()
 
@@ -156,12 +195,17 @@ def test_the_better_reading_is_kept_and_only_there(model: Banmo, helps: bool) ->
     assert float((posed(model, model.surface)[14:18] - wanted).norm(dim=-1).mean()) < 0.03
 
 
-def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene) -> None:
+def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even where it reads everything anew."""
+    monkeypatch.setattr(rethink, "doubtful", lambda error, model: torch.ones(len(error), dtype=torch.bool))
+    monkeypatch.setattr(rethink, "_LEAST_GAIN", -1e9)
+    monkeypatch.setattr(rethink, "_APART", 1e-3)
+    monkeypatch.setattr(trainer, "_PRACTISED", 1)
     settings = tiny_settings(iterations=6, rethink_at=(0.5,), rethink_share=0.7)
 
     def start() -> Trainer:
         model = model_of(seen, solid)
-        stir(model, 0.1)
+        stir(model, 1.0)
         return Trainer(model, seen.observations, settings)
 
     one, states = start(), []
@@ -169,6 +213,8 @@ def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene) -> N
         assert (one.rethought is not None) == (one.step_idx > 3)
         states.append(one.state())
         one.step()
+    assert one.rethought is not None and one.rethought.taken > 0
+    assert one.reread.tolist() == [one.rethought.looked_at, one.rethought.taken]
     for at in (3, 4):
         two = start()
         two.restore(states[at])

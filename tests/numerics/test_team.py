@@ -42,7 +42,7 @@ def train(team: Team) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
     return values, trainer.state()
 
 
-def think(team: Team) -> tuple[list[int], dict[str, torch.Tensor]]:
+def think(team: Team) -> tuple[list[float], dict[str, torch.Tensor]]:
     """Second thoughts about every frame, whatever the poses are."""
     rethink.doubtful = lambda error, model: torch.ones(len(error), dtype=torch.bool)  # type: ignore[assignment]
     rethink._APART, rethink._LEAST_GAIN, training._PRACTISED = 1e-4, -9.0, 1
@@ -160,7 +160,7 @@ def test_two_processes_lose_what_one_loses(members: list[dict[str, Any]]) -> Non
 def test_two_processes_think_alike(members: list[dict[str, Any]]) -> None:
     first, second = members
     assert first["thoughts"] == second["thoughts"]
-    looked_at, taken = first["thoughts"]
+    looked_at, taken, _ = first["thoughts"]
     assert looked_at >= 4 and taken >= 3
     for name, value in first["state_after"].items():
         assert torch.equal(value, second["state_after"][name]), name

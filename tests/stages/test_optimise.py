@@ -148,11 +148,9 @@ def test_second_thoughts_are_left_when_asked_to_stop(
 ) -> None:
     """They are long: what is lost is they and the steps since the last checkpoint, and the end is the same."""
 
-    def thinks_about_everything(
-        model: Banmo, seen: Any, figures: Any, practise: Any, seed: int, agree: Any
-    ) -> Rethought:
+    def thinks_about_everything(model: Banmo, seen: Any, figures: Any, practise: Any, *more: Any) -> Rethought:
         practise(deepcopy(model), seen)
-        return Rethought(6, 0)
+        return Rethought(6, 0, 0.0)
 
     class StopsThinking(Run):
         def tick(self, done: float, total: float = 0, label: str = "", **extra: Any) -> None:
