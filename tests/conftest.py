@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before torch is imported anywhere: threads that spin while they wait starve their neighbours on a busy machine.
@@ -26,3 +27,14 @@ def shared() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip("no evaluation data beside the repository (../shared/data)")
     return folder
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """One thread while a module's tests run: its problems are small, and sums then have one order."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -130,6 +130,7 @@ def test_a_reconstruction_of_a_ball_writes_its_surface(seen: Scene, tmp_path: Pa
     assert 0.9 < radius.mean() < 1.1 and ball.volume > 0  # normalised to half extent 1
 
 
+@pytest.mark.usefixtures("one_thread")  # as a stage that is given one
 def test_the_phases_are_those_of_the_product(seen: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = trials.Seen(seen.observations, seen.poses, seen.intrinsics, seen.videos)
     model, _ = trials.reconstruct(known, *SMALL, hold_roots=False)
