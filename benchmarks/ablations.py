@@ -45,7 +45,7 @@ ROWS: dict[str, Row] = {
     "full": Row(),
     **{f"bones-{n}": Row(fit={"bones": n}) for n in (4, 9, 16, 64)},
     "no-in-surface": Row(every={"weight_bone_location": 0.0}),
-    **{f"noise-{d}": Row(noise_deg=d, given_roots=False) for d in (20, 50, 90)},
+    **{f"noise-{d}": Row(noise_deg=d, given_roots=False, fit={"settle_root": False}) for d in (20, 50, 90)},
     **{f"clips-{n}": Row(clips=n) for n in (2, 4)},
     "active-25": Row(every={"active_share": 0.25}),
     "active-50": Row(every={"active_share": 0.5}),

@@ -76,7 +76,8 @@ class FitSettings(PhaseSettings):
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
-    """At the end, move to the root poses what all bones share, so that the trunk rests in object space."""
+    """At the end, move to the root poses what all bones share, so that the trunk rests in object space; given root
+    poses keep theirs."""
     lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.6

@@ -44,7 +44,7 @@ def run_phase(
 
     Under torchrun's variables (``RANK``, ``WORLD_SIZE``, ``MASTER_ADDR``, ``MASTER_PORT``) the processes share every
     step; all read the same checkpoint folder, and the first alone writes. `settle_root` moves to the root what all
-    bones share; `diagnose` writes ``diagnosis.json``.
+    bones share, unless root poses were given; `diagnose` writes ``diagnosis.json``.
     """
     if run.world_size > settings.frames_per_step:
         raise BadInput(
@@ -63,7 +63,7 @@ def run_phase(
     if diagnose:
         _diagnose(trainer, collection, out, run)
     if settle_root and model.dense is None:
-        run.metric("root_settled_deg", round(math.degrees(settle(model)), 3))
+        run.metric("root_settled_deg", round(math.degrees(settle(model, collection.root_given)), 3))
     _write_folder(model.to("cpu"), collection, history, out)
     for name, value in history[-1].items() if history else ():
         if name != "step":

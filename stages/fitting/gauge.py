@@ -17,8 +17,17 @@ from stages.model.banmo import Banmo
 
 
 @torch.no_grad()
-def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 25, steady_s: float = 0.1) -> float:
-    """Set ``model.gauge`` so that the surface moves least in object space; given root poses stay as they are.
+def settle(
+    model: Banmo,
+    given: Tensor | None = None,
+    most: int = 500,
+    softness: float = 0.05,
+    rounds: int = 25,
+    steady_s: float = 0.1,
+) -> float:
+    """Set ``model.gauge`` so that the surface moves least in object space; root poses that are held stay as they are.
+
+    `given` (V,) is true for videos whose root poses somebody gave: they may move, but their object space is meant.
 
     `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
     `steady_s` (seconds, a Gaussian's width) stays with the bones: a hand-held camera and a body's heading are slower.
@@ -34,7 +43,8 @@ def settle(model: Banmo, most: int = 500, softness: float = 0.05, rounds: int = 
         placed.append(model.forward_points(state, points[None].expand(len(some), -1, -1)).cpu())
         poses.append(state.camera_from_object.cpu())
     posed, whole = torch.cat(placed), torch.cat(poses)
-    free = (model.root_free[model.video_idx] > 0).cpu()
+    may = model.root_free > 0 if given is None else (model.root_free > 0) & ~given.to(model.root_free.device)
+    free = may[model.video_idx].cpu()
     if not free.any():
         return 0.0
     motion = rigid_parts(posed, free, softness, rounds)

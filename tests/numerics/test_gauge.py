@@ -94,3 +94,11 @@ def test_steadying_keeps_an_even_turn_and_takes_out_what_is_quick() -> None:
     before, after = (geodesic_angle(track[:, :3, :3], even[:, :3, :3]) for track in (shaken, found))
     assert float(after.mean()) < 0.5 * float(before.mean())
     assert torch.equal(steadied(even[:2], time[:2], 0.2), even[:2])
+
+
+def test_given_root_poses_keep_their_object_space_though_they_may_move(model: Banmo) -> None:
+    assert settle(model, torch.tensor([True, True])) == 0.0
+    assert torch.equal(model.gauge, torch.eye(4).expand(16, 4, 4))
+    assert settle(model, torch.tensor([True, False])) > 0.0
+    assert torch.equal(model.gauge[:8], torch.eye(4).expand(8, 4, 4))
+    assert float((model.gauge[8:] - torch.eye(4)).abs().max()) > 0.01
