@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from stages.fitting.observations import Observations
+from stages.fitting.renew import posed
 from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import invert_rigid
 from stages.model.banmo import Banmo
@@ -30,11 +31,7 @@ def known_shapes(model: Banmo, frames: Tensor, points: Tensor) -> Tensor:
     The part of a motion that was moved from the bones to the root pose (``model.gauge``) is taken off again: codes
     drive bones.
     """
-    parts = []
-    for chunk in frames.split(32):
-        posed = model.forward_points(model.frames(chunk), points[None].expand(len(chunk), -1, -1))
-        parts.append(transform(invert_rigid(model.gauge[chunk]), posed))
-    return torch.cat(parts)
+    return transform(invert_rigid(model.gauge[frames]), posed(model, points, frames))
 
 
 def mask_distance(silhouette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -72,7 +69,7 @@ def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Obse
         row = pixels[..., 1].floor().long().clamp(0, height - 1)
         beyond = torch.from_numpy(outside)[row, column].mean(1)
         bare = torch.cdist(torch.from_numpy(wanted)[None].expand(len(shapes), -1, -1), pixels).amin(-1)
-        size = max(8.0, float(np.sqrt(len(wanted) and (outside == 0).sum())))
+        size = max(8.0, float(np.sqrt((outside == 0).sum())))
         cost[t] = (beyond + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size
     return cost
 

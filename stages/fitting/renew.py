@@ -29,10 +29,10 @@ def change_bones(model: Banmo, bones: Bones, points: Tensor, seed: int, steps: i
 
 
 @torch.no_grad()
-def posed(model: Banmo, points: Tensor) -> Tensor:
-    """Canonical points (N, 3) in object space in all T kept frames, (T, N, 3)."""
-    every = torch.arange(len(model.time)).split(64)
-    return torch.cat([model.forward_points(model.frames(i), points[None].expand(len(i), -1, -1)) for i in every])
+def posed(model: Banmo, points: Tensor, frames: Tensor | None = None) -> Tensor:
+    """Canonical points (N, 3) in object space in kept `frames` (T,), or in all of them: (T, N, 3)."""
+    parts = (torch.arange(len(model.time)) if frames is None else frames).split(64)
+    return torch.cat([model.forward_points(model.frames(i), points[None].expand(len(i), -1, -1)) for i in parts])
 
 
 def imitate(model: Banmo, points: Tensor, target: Tensor, seed: int, steps: int = 200) -> float:
