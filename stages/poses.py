@@ -140,10 +140,11 @@ def _steadied(
     """Given poses that the optimiser may move begin without their jitter: it moves them smoothly."""
     if not tracks:
         return tracks
-    matrices, turned_s, placed_s = steady(
+    matrices, (axis_s, around_s), placed_s = steady(
         [track.object_to_camera for track in tracks.values()], [clips[name].time_s for name in tracks]
     )
-    run.metric("steadied_turns_s", turned_s)
+    run.metric("steadied_axis_s", axis_s)
+    run.metric("steadied_turns_s", around_s)
     run.metric("steadied_places_s", placed_s)
     return {
         name: replace(track, object_to_camera=made)

@@ -19,6 +19,7 @@ from stages.model.banmo import Banmo, FrameState
 from stages.model.correspondence import soft_argmax
 from stages.model.fields import GridField
 
+_GIVEN_TURN, _GIVEN_SHIFT = 0.1, 0.03  # radians, units: how far given root poses that may move are off
 _PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
 
 
@@ -321,6 +322,12 @@ def motion_terms(model: Banmo, frame_idx: Tensor, settings: PhaseSettings) -> di
         shift = roots[..., :3, 3]
         bend = (shift[:, 0] - 2 * shift[:, 1] + shift[:, 2]).norm(dim=-1)
         terms["root"] = settings.weight_root * (((second - first).norm(dim=-1) + bend) * whole).mean()
+        given = torch.tensor([float(v.root_given) for v in model.videos], device=flat.device)[video[:, 1]]
+        if settings.weight_given and bool(given.any()):
+            base = model.base_poses[triple[:, 1]]
+            turn = so3_log(base[:, :3, :3].transpose(1, 2) @ rotation[:, 1]).square().sum(-1) / _GIVEN_TURN**2
+            away = (shift[:, 1] - base[:, :3, 3]).square().sum(-1) / _GIVEN_SHIFT**2
+            terms["given"] = settings.weight_given * (given * ((1 + turn).sqrt() - 1 + away)).mean()
     return terms
 
 

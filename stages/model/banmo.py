@@ -40,6 +40,8 @@ class VideoFacts:
     height: int
     focal_px: tuple[float, float]
     principal_px: tuple[float, float]
+    root_given: bool = False
+    """Somebody gave the root poses: they may move, but their object space is meant."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +239,7 @@ class Banmo(nn.Module):
                 height=v["height"],
                 focal_px=tuple(v["focal_px"]),
                 principal_px=tuple(v["principal_px"]),
+                root_given=bool(v.get("root_given", False)),
             )
             for v in description["videos"]
         ]

@@ -1,8 +1,10 @@
 """Root poses that jitter from frame to frame, made steady: what no camera and no animal does in a fiftieth of a second.
 
-Each pose is replaced by a robust local line through its neighbours (local regression on the group of rotations). How
-far the neighbourhood reaches is chosen by leaving each frame out and predicting it from the others: poses that move
-smoothly as they are predict each other best from close by, and are left alone.
+Whoever films goes around the subject and hardly rolls or climbs. So a track of rotations is taken apart into where the
+axis points that the camera goes around (in camera space, nearly still), and how far it has gone around it. Each of
+them, and the translation, is replaced by a robust local line through its neighbours. How far the neighbourhood reaches
+is chosen by leaving each frame out and predicting it from the others: poses that move smoothly as they are predict
+each other best from close by, and are left alone.
 """
 
 from __future__ import annotations
@@ -12,57 +14,69 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9)
+REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9, 1.4, 2.2, 5.0)
 """Reaches that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
 _FEWEST = 8
 _WORTH = 0.95  # share of the closest neighbours' error that a farther reach has to get below
 _NOTHING = 1e-4  # radians or units: no jitter at all
 _ROUNDS = 6
-_CORNER_RAD, _CORNER = 0.05, 0.02  # residuals below these count fully: radians, units
+_FAR = 2.0  # of the mean residual: what is further off counts in proportion less (Huber)
 
 
-def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> tuple[list[np.ndarray], float, float]:
-    """Steadied camera_from_object (T, 4, 4) of every clip, and the reaches (s) of rotations and of translations.
+def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> tuple[list[np.ndarray], tuple[float, float], float]:
+    """Steadied camera_from_object (T, 4, 4) of every clip; reaches (s) of the axis and of the way around it, of places.
 
     `times_s` (T,) are the frames' times in seconds. A reach fits all clips; 0 means left alone.
     """
-    turned_s = _reach(tracks, times_s, _turn_misses)
-    placed_s = _reach(tracks, times_s, _place_misses)
+    long = [i for i, track in enumerate(tracks) if len(track) >= _FEWEST]
     out = [track.copy() for track in tracks]
-    for made, track, time in zip(out, tracks, times_s, strict=True):
-        if turned_s and len(track) >= _FEWEST:
-            made[:, :3, :3] = _turns(track[:, :3, :3], _neighbourhood(time, turned_s))
-        if placed_s and len(track) >= _FEWEST:
-            made[:, :3, 3] = _places(track[:, :3, 3], _neighbourhood(time, placed_s))
-    return out, turned_s, placed_s
-
-
-def _reach(
-    tracks: list[np.ndarray],
-    times_s: list[np.ndarray],
-    misses: Callable[[np.ndarray, np.ndarray], np.ndarray],
-) -> float:
-    """The reach whose lines predict left-out frames best; 0 if none does better than the closest neighbours."""
-    long = [(track, time) for track, time in zip(tracks, times_s, strict=True) if len(track) >= _FEWEST]
     if not long:
-        return 0.0
+        return out, (0.0, 0.0), 0.0
+    times = [times_s[i] for i in long]
+    turns = [tracks[i][:, :3, :3] for i in long]
+    axis = main_axis(turns)
+    axis_s, aside = _steadied([turn @ axis for turn in turns], times, _directions, _angle_between)
+    still = [_turned_onto(turn @ axis, made) @ turn for turn, made in zip(turns, aside, strict=True)]
+    frames = [_frames_around(axis, made, turn) for made, turn in zip(aside, still, strict=True)]
+    gone = [
+        Rotation.from_matrix(frame.transpose(0, 2, 1) @ turn).as_rotvec() @ axis
+        for frame, turn in zip(frames, still, strict=True)
+    ]
+    around_s, smooth = _steadied(gone, times, _headings, _angle_apart)
+    placed_s, places = _steadied([tracks[i][:, :3, 3] for i in long], times, _places, _distance)
+    for k, i in enumerate(long):
+        if axis_s or around_s:
+            out[i][:, :3, :3] = frames[k] @ Rotation.from_rotvec(smooth[k][:, None] * axis).as_matrix()
+        if placed_s:
+            out[i][:, :3, 3] = places[k]
+    return out, (axis_s, around_s), placed_s
+
+
+def main_axis(turns: list[np.ndarray]) -> np.ndarray:
+    """The direction (3,) in object space that moves least in camera space, over clips of rotations (T, 3, 3)."""
+    spread = sum(turn.mean(0).T @ turn.mean(0) for turn in turns)
+    return np.asarray(np.linalg.eigh(spread)[1][:, -1])
+
+
+def _steadied(
+    seen: list[np.ndarray],
+    times_s: list[np.ndarray],
+    lines: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    misses: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[float, list[np.ndarray]]:
+    """The reach whose `lines` predict left-out frames best, and what they make of each clip.
+
+    If no reach does better than the closest neighbours: 0, and the clips as they are.
+    """
     errors = []
     for reach in REACHES_S:
-        found = [misses(track, _neighbourhood(time, reach, leave_out=True)) for track, time in long]
-        errors.append(float(np.concatenate(found).mean()))
+        left_out = [(one, _neighbourhood(time, reach, leave_out=True)) for one, time in zip(seen, times_s, strict=True)]
+        errors.append(float(np.concatenate([misses(lines(one, near), one) for one, near in left_out]).mean()))
     best = int(np.argmin(errors))
-    return REACHES_S[best] if errors[best] < _WORTH * errors[0] and errors[0] > _NOTHING else 0.0
-
-
-def _turn_misses(track: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Angles (T,) between each frame and its line, radians."""
-    rest = _turns(track[:, :3, :3], weight).transpose(0, 2, 1) @ track[:, :3, :3]
-    return np.linalg.norm(Rotation.from_matrix(rest).as_rotvec(), axis=-1)
-
-
-def _place_misses(track: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Distances (T,) between each frame and its line, units."""
-    return np.linalg.norm(_places(track[:, :3, 3], weight) - track[:, :3, 3], axis=-1)
+    if errors[best] >= _WORTH * errors[0] or errors[0] <= _NOTHING:
+        return 0.0, seen
+    reach = REACHES_S[best]
+    return reach, [lines(one, _neighbourhood(time, reach)) for one, time in zip(seen, times_s, strict=True)]
 
 
 def _neighbourhood(time: np.ndarray, reach: float, leave_out: bool = False) -> np.ndarray:
@@ -82,18 +96,30 @@ def _line(weight: np.ndarray, away: np.ndarray, values: np.ndarray) -> np.ndarra
     return (s2[:, None] * y0 - s1[:, None] * y1) / determinant[:, None]
 
 
-def _turns(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Rotations (T, 3, 3) of the local lines through `seen` (T, 3, 3)."""
+def _robust(weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """`weight` (T, T), less where the residual (T, T) is far above what is usual: single frames may be anywhere."""
+    usual = (weight * residual).sum() / weight.sum()
+    return np.asarray(weight * np.minimum(1.0, _FAR * usual / np.maximum(residual, 1e-12)))
+
+
+def _directions(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Directions (T, 3) of the local lines through `seen` (T, 3), on the sphere."""
     weight, away = near
-    u, _, v = np.linalg.svd(np.einsum("ts,sij->tij", weight, seen))
-    u[..., -1] *= np.linalg.det(u @ v)[:, None]
-    made = u @ v
+    made = _unit(weight @ seen)
     for _ in range(_ROUNDS):
-        turns = made.transpose(0, 2, 1)[:, None] @ seen[None]
-        vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(len(seen), len(seen), 3)
-        robust = weight / (np.linalg.norm(vectors, axis=-1) + _CORNER_RAD)
-        made = made @ Rotation.from_rotvec(_line(robust, away, vectors)).as_matrix()
+        gaps = seen[None] - made[:, None]
+        made = _unit(made + _line(_robust(weight, np.linalg.norm(gaps, axis=-1)), away, gaps))
     return made
+
+
+def _headings(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Angles (T,) of the local lines through `seen` (T,), radians, on the circle."""
+    weight, away = near
+    made = np.angle(weight @ np.exp(1j * seen))
+    for _ in range(_ROUNDS):
+        apart = np.angle(np.exp(1j * (seen[None] - made[:, None])))
+        made = made + _line(_robust(weight, np.abs(apart)), away, apart[..., None])[:, 0]
+    return np.asarray(made)
 
 
 def _places(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -102,6 +128,41 @@ def _places(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
     made = (weight @ seen) / weight.sum(1, keepdims=True)
     for _ in range(_ROUNDS):
         gaps = seen[None] - made[:, None]
-        robust = weight / (np.linalg.norm(gaps, axis=-1) + _CORNER)
-        made = made + _line(robust, away, gaps)
+        made = made + _line(_robust(weight, np.linalg.norm(gaps, axis=-1)), away, gaps)
     return made
+
+
+def _angle_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Radians (T,) between directions (T, 3); exact also where they are close."""
+    return np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(1))
+
+
+def _angle_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.abs(np.angle(np.exp(1j * (one - other))))
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(one - other, axis=-1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _turned_onto(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The least rotations (T, 3, 3) that take directions (T, 3) onto others."""
+    axis = np.cross(one, other)
+    angle = _angle_between(one, other)
+    return Rotation.from_rotvec(_unit(axis) * angle[:, None]).as_matrix()
+
+
+def _frames_around(axis: np.ndarray, aside: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Rotations (T, 3, 3) that take `axis` to where it is seen, `aside` (T, 3), and turn about it as little as can be.
+
+    They start from the mean of `turns` (T, 3, 3), so that what is left to go around the axis does not wrap early.
+    """
+    u, _, v = np.linalg.svd(turns.mean(0))
+    u[:, -1] *= np.linalg.det(u @ v)
+    middle = u @ v
+    start = np.broadcast_to(middle @ axis, aside.shape)
+    return _turned_onto(start, aside) @ middle

@@ -94,7 +94,7 @@ def test_what_the_picture_does_not_show_is_not_held_against_a_place(seen: Scene)
     assert share_on_masks(model, seen.observations, torch.tensor([[0.0, 40.0, 0.0]])) == pytest.approx([1])
 
 
-def test_a_run_mends_when_bounds_are_updated_and_only_then(seen: Scene) -> None:
+def test_a_run_mends_when_bounds_are_updated_and_at_its_end(seen: Scene) -> None:
     # The limb is true to the model and beside the masks of the scene, which show a ball: all but the body goes.
     settings = {"iterations": 8, "mend_from": 0.3, "update_bounds_every": 3, "lr_sdf": 1e-6}
     for wanted in (True, False):
@@ -104,3 +104,9 @@ def test_a_run_mends_when_bounds_are_updated_and_only_then(seen: Scene) -> None:
             trainer.step()
             counts.append(parts(trainer.model))
         assert counts == ([3, 3, 3, 1, 1] if wanted else [3] * 5)
+    short = {**settings, "iterations": 2, "update_bounds_every": 100}
+    trainer = Trainer(model_of(seen, loose), seen.observations, tiny_settings(mend=True, **short))
+    trainer.step()
+    assert parts(trainer.model) == 3
+    trainer.step()
+    assert trainer.done and parts(trainer.model) == 1

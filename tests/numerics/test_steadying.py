@@ -40,7 +40,7 @@ def shaken(truth: np.ndarray, degrees: float, units: float = 0.0) -> np.ndarray:
 def test_smooth_motion_is_left_alone(rate: float) -> None:
     truth = track(rate)
     (made,), turned_s, placed_s = steady([truth], [TIME])
-    assert (turned_s, placed_s) == (0.0, 0.0)
+    assert (turned_s, placed_s) == ((0.0, 0.0), 0.0)
     assert np.array_equal(made, truth)
 
 
@@ -49,7 +49,7 @@ def test_most_of_a_jitter_goes(degrees: float, left: float) -> None:
     truth = [track(1.0, 0.1), track(-1.0, 0.1)]
     seen = [shaken(t, degrees) for t in truth]
     made, turned_s, placed_s = steady(seen, [TIME, TIME])
-    assert turned_s > 0.05 and placed_s == 0.0
+    assert min(turned_s) > 0.05 and placed_s == 0.0
     for found, before, t in zip(made, seen, truth, strict=True):
         assert errors(found, t)[0] < left * errors(before, t)[0]
         assert np.array_equal(found[:, :3, 3], t[:, :3, 3])
@@ -61,7 +61,7 @@ def test_places_are_steadied_by_themselves() -> None:
     truth = track(1.0)
     seen = shaken(truth, 0.0, 0.05)
     (made,), turned_s, placed_s = steady([seen], [TIME])
-    assert turned_s == 0.0 < placed_s
+    assert turned_s == (0.0, 0.0) and placed_s > 0.0
     assert errors(made, truth)[1] < 0.5 * errors(seen, truth)[1]
 
 
@@ -76,4 +76,4 @@ def test_one_frame_that_is_far_off_is_brought_back() -> None:
 def test_a_clip_of_a_few_frames_stays() -> None:
     short = shaken(track(), 20.0)[:5]
     (made,), turned_s, _ = steady([short], [TIME[:5]])
-    assert turned_s == 0.0 and np.array_equal(made, short)
+    assert turned_s == (0.0, 0.0) and np.array_equal(made, short)
