@@ -25,7 +25,6 @@ class Collection:
     root_fixed: Tensor  # (V,) 1 where root poses are held: the user gave them and did not ask to refine
     confidence: list[np.ndarray]  # root-pose confidence, a video
     clips: dict[str, formats.Clip]
-    root_given: Tensor | None = None  # (V,) true where the user gave root poses, held or not
 
 
 def collect(
@@ -81,7 +80,6 @@ def collect(
         root_fixed=torch.tensor([float(said[name]["fixed"]) for name in clips]),
         confidence=[t.confidence for t in tracks],
         clips=clips,
-        root_given=torch.tensor([said[name].get("provider") == "given" for name in clips]),
     )
 
 

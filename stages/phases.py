@@ -63,7 +63,7 @@ def run_phase(
     if diagnose:
         _diagnose(trainer, collection, out, run)
     if settle_root and model.dense is None:
-        run.metric("root_settled_deg", round(math.degrees(settle(model, collection.root_given)), 3))
+        run.metric("root_settled_deg", round(math.degrees(settle(model)), 3))
     _write_folder(model.to("cpu"), collection, history, out)
     for name, value in history[-1].items() if history else ():
         if name != "step":

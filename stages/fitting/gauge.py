@@ -19,7 +19,6 @@ from stages.model.banmo import Banmo
 @torch.no_grad()
 def settle(
     model: Banmo,
-    given: Tensor | None = None,
     most: int = 500,
     softness: float = 0.05,
     rounds: int = 25,
@@ -27,7 +26,7 @@ def settle(
 ) -> float:
     """Set ``model.gauge`` so that the surface moves least in object space; root poses that are held stay as they are.
 
-    `given` (V,) is true for videos whose root poses somebody gave: they may move, but their object space is meant.
+    So do those that somebody gave and that may move (``root_given``): their object space is meant.
 
     `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
     `steady_s` (seconds, a Gaussian's width) stays with the bones: a hand-held camera and a body's heading are slower.
@@ -43,7 +42,8 @@ def settle(
         placed.append(model.forward_points(state, points[None].expand(len(some), -1, -1)).cpu())
         poses.append(state.camera_from_object.cpu())
     posed, whole = torch.cat(placed), torch.cat(poses)
-    may = model.root_free > 0 if given is None else (model.root_free > 0) & ~given.to(model.root_free.device)
+    given = torch.tensor([video.root_given for video in model.videos], device=model.root_free.device)
+    may = (model.root_free > 0) & ~given
     free = may[model.video_idx].cpu()
     if not free.any():
         return 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -164,6 +165,25 @@ def test_motion_terms_of_rest_and_of_jerks(seen: Scene) -> None:
     stir(model, 0.8)
     wild = objective.motion_terms(model, frames, FINE)
     assert all(float(wild[name].detach()) > 5 * float(rest[name].detach()) for name in ("joints", "motion"))
+
+
+def test_given_root_poses_that_may_move_are_held_softly(seen: Scene) -> None:
+    settings = replace(FINE, lr_root=1e-3, weight_given=2.0)
+    frames = torch.arange(1, 5)
+    model, _ = ready(model_of(seen, ball))
+    with torch.no_grad():
+        model.root.head.out.bias.copy_(torch.tensor([0.2, 0.0, 0.0, 0.0, 0.0, 0.1]))  # a turn, and 0.3 * 0.1 of depth
+        model.root.head.out.weight.zero_()
+    assert "given" not in objective.motion_terms(model, frames, settings)
+    model.videos = [replace(video, root_given=True) for video in model.videos]
+    found = objective.motion_terms(model, frames, settings)["given"]
+    assert float(found.detach()) == pytest.approx(2.0 * ((1 + 2.0**2) ** 0.5 - 1 + 1.0), rel=1e-3)
+    found.backward()
+    pull = model.root.head.out.bias.grad
+    assert pull is not None and float(pull[0]) > 0 and float(pull[5]) > 0
+    assert "given" not in objective.motion_terms(model, frames, replace(settings, weight_given=0.0))
+    restored = Banmo.restore(model.state_dict(), model.describe())
+    assert all(video.root_given for video in restored.videos)
 
 
 def test_neighbours_are_the_gabriel_graph() -> None:
