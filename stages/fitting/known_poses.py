@@ -18,8 +18,6 @@ from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import invert_rigid
 from stages.model.banmo import Banmo
 
-BARE = 1.5  # what of a mask nothing covers, against what is outside
-
 
 def spread(count: int, most: int) -> Tensor:
     """Up to `most` indices (N,) spread evenly over `count`."""
@@ -66,36 +64,21 @@ def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Obse
             continue
         placed = transform(poses[t], shapes.reshape(-1, 3))
         pixels = project(intrinsics[t], placed).reshape(*shapes.shape[:2], 2) * scale
-        beyond = looked_up(outside, pixels).mean(1)
+        height, width = outside.shape
+        column = pixels[..., 0].floor().long().clamp(0, width - 1)
+        row = pixels[..., 1].floor().long().clamp(0, height - 1)
+        beyond = torch.from_numpy(outside)[row, column].mean(1)
         bare = torch.cdist(torch.from_numpy(wanted)[None].expand(len(shapes), -1, -1), pixels).amin(-1)
         size = max(8.0, float(np.sqrt((outside == 0).sum())))
-        cost[t] = (beyond + BARE * (bare - 1.0).clamp_min(0).mean(1)) / size
+        cost[t] = (beyond + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size
     return cost
 
 
-def looked_up(image: np.ndarray, pixels: Tensor) -> Tensor:
-    """Values (...) of an image (H, W) at pixels (..., 2), the nearest inside."""
-    height, width = image.shape
-    column = pixels[..., 0].floor().long().clamp(0, width - 1)
-    row = pixels[..., 1].floor().long().clamp(0, height - 1)
-    return torch.from_numpy(image)[row, column]
-
-
-def runs(frames: Tensor, model: Banmo) -> list[Tensor]:
-    """Frame indices (N,), sorted, cut wherever one is missing or another clip begins."""
-    video = model.video_idx.cpu()[frames]
-    cut = torch.nonzero((frames[1:] != frames[:-1] + 1) | (video[1:] != video[:-1]))[:, 0] + 1
-    return [part for part in torch.tensor_split(frames, cut) if len(part)]
-
-
 def best_sequence(cost: Tensor, jump: Tensor) -> Tensor:
-    """Indices (T,) of least total cost (T, K) plus price of going from one to the next (Viterbi).
-
-    `jump` is (K, K), the same at all times, or (T - 1, K, K).
-    """
+    """Indices (T,) of least total cost (T, K) plus price of going from one to the next (K, K) (Viterbi)."""
     total, back = cost[0].clone(), []
     for t in range(1, len(cost)):
-        ways = total[:, None] + (jump if jump.ndim == 2 else jump[t - 1])
+        ways = total[:, None] + jump
         best, where = ways.min(0)
         back.append(where)
         total = best + cost[t]

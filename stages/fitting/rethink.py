@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from stages.fitting.diagnose import FrameFigures
-from stages.fitting.known_poses import best_sequence, known_shapes, misfit, runs, spread
-from stages.fitting.limbs import hung, other_limbs
+from stages.fitting.known_poses import best_sequence, known_shapes, misfit, spread
 from stages.fitting.observations import Observations
 from stages.fitting.renew import imitate, posed
 from stages.model.banmo import Banmo
@@ -36,8 +35,6 @@ _MOST_SHARE = 0.35  # of a clip that is looked at: beyond that the clip, not the
 _ONE_FRAME = 1.5  # of its clip's usual error: what a single frame can say at most
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
 _LEAST_GAIN = -0.01  # of the usual error; below zero: where pictures do not tell, a pose seen elsewhere is likelier
-_SWING_S = 0.2  # seconds over which it is judged whether limbs lie better in other poses, and the least that is taken
-_BETTER_BY = 0.12  # share of the misfit that has to go by that
 _JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit between successive frames
 _POINTS, _MOST_POSES, _IMITATED = 160, 400, 400
 
@@ -70,27 +67,21 @@ def second_thoughts(
     before = _errors(figures_of(model, observations))
     usual = before.nanmedian(0).values.clamp_min(1e-4)
     found = _relative(before, usual)
-    local, better_by = (agree(told) for told in other_limbs(model, observations, worst_pieces(found, model, 2 * most)))
-    limbs = worst(swapped(better_by, model), better_by, model, most)
-    doubted = doubtful(found, model) & ~limbs
-    wanted = agree(other_reading(model, observations, worst(doubted, found, model, most - int(limbs.sum()))))
-    looked_at = limbs | (wanted >= 0)
+    other = deepcopy(model)
+    wanted = agree(other_reading(model, observations, worst(doubtful(found, model), found, model, most)))
+    looked_at = wanted >= 0
     if not looked_at.any():
         return Rethought(0, 0, 0.0)
     focus = replace(observations, frame_weight=observations.frame_weight * looked_at)
-    same, other = deepcopy(model), deepcopy(model)
     redirect(other, wanted)
-    points = model.surface[spread(len(model.surface), _IMITATED)]
-    if limbs.any():
-        target = posed(other, points)
-        target[limbs] = hung(model, local, points, torch.nonzero(limbs)[:, 0])
-        imitate(other, points, target, seed)
+    same = deepcopy(model)
     for copy in (same, other):
         practise(copy, focus)
     gain = _relative(_errors(figures_of(same, focus)), usual) - _relative(_errors(figures_of(other, focus)), usual)
     taken = agree(better(gain, looked_at, model).long()) > 0
     left = 0.0
     if taken.any():
+        points = model.surface[spread(len(model.surface), _IMITATED)]
         target = torch.where(taken[:, None, None].to(points.device), posed(other, points), posed(model, points))
         redirect(model, torch.where(taken, wanted, -1))
         left = imitate(model, points, target, seed, steps=max(200, len(target) // 12))
@@ -129,31 +120,9 @@ def doubtful(error: Tensor, model: Banmo) -> Tensor:
     return found
 
 
-def swapped(better_by: Tensor, model: Banmo) -> Tensor:
-    """Frames (T,) of stretches in which other poses of limbs take away a good share of the misfit (T,)."""
-    found = torch.zeros(len(better_by), dtype=torch.bool)
-    for mine, frames_a_second in _clips(model):
-        smooth = _smoothed(better_by[mine], _window(_SWING_S * frames_a_second))
-        found[mine] = _long_runs(smooth > _BETTER_BY, _SWING_S * frames_a_second)
-    return found
-
-
-def worst_pieces(error: Tensor, model: Banmo, most: int) -> Tensor:
-    """About `most` frames (T,), of the pieces of clips, a second or so long, whose mean error (T,) is largest."""
-    pieces = []
-    for mine, frames_a_second in _clips(model):
-        every = torch.arange(mine.start, mine.stop)
-        pieces += [piece for piece in every.tensor_split(max(1, round(len(every) / frames_a_second))) if len(piece)]
-    kept = torch.zeros(len(error), dtype=torch.bool)
-    for piece in sorted(pieces, key=lambda some: -float(error[some].nan_to_num().mean())):
-        if int(kept.sum()) < most:
-            kept[piece] = True
-    return kept
-
-
 def worst(frames: Tensor, error: Tensor, model: Banmo, most: int) -> Tensor:
     """Of the stretches in `frames` (T,) those with the largest mean error (T,), about `most` frames in all, as (T,)."""
-    stretches = runs(torch.nonzero(frames)[:, 0], model)
+    stretches = _runs(torch.nonzero(frames)[:, 0], model)
     kept = torch.zeros_like(frames)
     for stretch in sorted(stretches, key=lambda some: -float(error[some].nanmean())):
         if int(kept.sum()) + len(stretch) <= most or not kept.any():
@@ -190,7 +159,7 @@ def other_reading(model: Banmo, observations: Observations, frames: Tensor) -> T
     points = model.surface[spread(len(model.surface), _POINTS)]
     shapes = known_shapes(model, known, points).cpu()
     jump = _JUMP * torch.stack([(shapes - shape).norm(dim=-1).mean(-1) for shape in shapes])
-    for stretch in runs(asked, model):
+    for stretch in _runs(asked, model):
         states = [model.frames(part) for part in stretch.split(64)]
         poses = torch.cat([state.camera_from_object for state in states]) @ model.gauge[stretch]
         intrinsics = torch.cat([state.intrinsics for state in states])
@@ -256,3 +225,10 @@ def _long_runs(flags: Tensor, frames: float) -> Tensor:
             kept[start:i] = i - start >= least
             start = None
     return kept
+
+
+def _runs(frames: Tensor, model: Banmo) -> list[Tensor]:
+    """Frame indices (N,), sorted, cut wherever one is missing or another clip begins."""
+    video = model.video_idx.cpu()[frames]
+    cut = torch.nonzero((frames[1:] != frames[:-1] + 1) | (video[1:] != video[:-1]))[:, 0] + 1
+    return [part for part in torch.tensor_split(frames, cut) if len(part)]

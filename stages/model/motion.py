@@ -123,15 +123,10 @@ class BodyPose(nn.Module):
         """J (N, B, 4, 4) at `time` (N,), own turns and shifts (N, B, 6), and codes (N, C); `centres` (B, 3)."""
         code = self.code(video_idx, time)
         vectors, shift = self.head(code)
-        local = local_motion(vectors, shift, centres, parents)
+        rotation = so3_exp(vectors)
+        joints = (centres + centres[parents]) / 2
+        local = rigid(rotation, joints - (rotation @ joints[..., None]).squeeze(-1) + shift)
         return chain(local, parents), torch.cat([vectors, shift], -1), code
-
-
-def local_motion(vectors: Tensor, shift: Tensor, centres: Tensor, parents: Tensor) -> Tensor:
-    """Motions (N, B, 4, 4) in the parents' frames: turns (N, B, 3) about the joints with them, and shifts (N, B, 3)."""
-    rotation = so3_exp(vectors)
-    joints = (centres + centres[parents]) / 2
-    return rigid(rotation, joints - (rotation @ joints[..., None]).squeeze(-1) + shift)
 
 
 def chain(local: Tensor, parents: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ def _line(weight: np.ndarray, away: np.ndarray, values: np.ndarray) -> np.ndarra
 def _robust(weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """`weight` (T, T), less where the residual (T, T) is far above what is usual: single frames may be anywhere."""
     usual = (weight * residual).sum() / weight.sum()
-    return np.asarray(weight * np.minimum(1.0, _FAR * usual / np.maximum(residual, 1e-12)))
+    return np.asarray(weight * np.where(residual <= _FAR * usual, 1.0, _FAR * usual / np.maximum(residual, 1e-12)))
 
 
 def _directions(seen: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages.registration.steadying import steady
+from stages.registration.steadying import main_axis, steady
 
 FRAMES = 60
 TIME = np.arange(FRAMES) / 20
@@ -55,6 +55,24 @@ def test_most_of_a_jitter_goes(degrees: float, left: float) -> None:
         assert np.array_equal(found[:, :3, 3], t[:, :3, 3])
         identity = found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1)
         assert identity == pytest.approx(np.tile(np.eye(3), (FRAMES, 1, 1)), abs=1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("degrees", [0.0, 5.0, 20.0, 50.0])
+def test_whoever_walks_around_upright_keeps_upright(degrees: float) -> None:
+    """The axis that a camera goes around stands nearly still in its pictures: all frames tell where it points."""
+    truth = [np.tile(np.eye(4), (FRAMES, 1, 1)) for _ in range(2)]
+    for track_, rate in zip(truth, (0.6, -0.6), strict=True):
+        around = Rotation.from_euler("y", rate * TIME[:, None])
+        track_[:, :3, :3] = (Rotation.from_euler("x", 0.3) * around).as_matrix()
+        track_[:, 2, 3] = 3.0
+    seen = [shaken(t, degrees) for t in truth]
+    assert abs(main_axis([s[:, :3, :3] for s in seen])[1]) > 0.9
+    made, _, _ = steady(seen, [TIME, TIME])
+    for found, t in zip(made, truth, strict=True):
+        assert errors(found, t)[0] <= 0.22 * degrees + 1e-5
+        tilt = np.degrees(np.arccos(np.clip((found[:, :3, 1] * t[:, :3, 1]).sum(1), -1, 1)))
+        assert tilt.mean() <= 0.2 * degrees + 1e-5
 
 
 def test_places_are_steadied_by_themselves() -> None:
