@@ -103,7 +103,7 @@ class PhaseSettings:
     weight_root: float = 0.5
     """Acceleration of root poses between frames."""
     weight_given: float = 0.003
-    """Distance of root poses from those that were given and may move, in what these are trusted to."""
+    """How firmly root poses that were given, and may move, stay near what was given."""
     match_pixels: int = 192
     """Pixels a step that take part in matching and the 2D cycle."""
     match_every: int = 2
