@@ -102,7 +102,7 @@ class PhaseSettings:
     """Acceleration of bones between frames."""
     weight_root: float = 0.5
     """Acceleration of root poses between frames."""
-    weight_given: float = 0.003
+    weight_given: float = 0.01
     """How firmly root poses that were given, and may move, stay near what was given."""
     match_pixels: int = 192
     """Pixels a step that take part in matching and the 2D cycle."""
