@@ -42,8 +42,7 @@ def settle(
         placed.append(model.forward_points(state, points[None].expand(len(some), -1, -1)).cpu())
         poses.append(state.camera_from_object.cpu())
     posed, whole = torch.cat(placed), torch.cat(poses)
-    given = torch.tensor([video.root_given for video in model.videos], device=model.root_free.device)
-    may = (model.root_free > 0) & ~given
+    may = (model.root_free > 0) & ~model.root_given
     free = may[model.video_idx].cpu()
     if not free.any():
         return 0.0

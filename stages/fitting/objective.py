@@ -312,17 +312,16 @@ def motion_terms(model: Banmo, frame_idx: Tensor, settings: PhaseSettings) -> di
         p = posed.reshape(*triple.shape, -1, 3)
         jerk = torch.sqrt((p[:, 0] - 2 * p[:, 1] + p[:, 2]).square().sum(-1) + 1e-6).mean(-1)
         terms["motion"] = settings.weight_motion * (jerk * whole).mean()
-    if settings.weight_root and settings.lr_root:
+    if settings.lr_root and (settings.weight_root or settings.weight_given):
         v = model.video_idx[flat]
         roots = model.root(v, model.time[flat], model.base_poses[flat], model.root_free[v])
         roots = roots.reshape(*triple.shape, 4, 4)
-        rotation = roots[..., :3, :3]
+        rotation, shift = roots[..., :3, :3], roots[..., :3, 3]
         first = so3_log(rotation[:, 0].transpose(1, 2) @ rotation[:, 1])
         second = so3_log(rotation[:, 1].transpose(1, 2) @ rotation[:, 2])
-        shift = roots[..., :3, 3]
         bend = (shift[:, 0] - 2 * shift[:, 1] + shift[:, 2]).norm(dim=-1)
         terms["root"] = settings.weight_root * (((second - first).norm(dim=-1) + bend) * whole).mean()
-        given = torch.tensor([float(v.root_given) for v in model.videos], device=flat.device)[video[:, 1]]
+        given = (model.root_given & (model.root_free > 0))[video[:, 1]]
         if settings.weight_given and bool(given.any()):
             base = model.base_poses[triple[:, 1]]
             turn = so3_log(base[:, :3, :3].transpose(1, 2) @ rotation[:, 1]).square().sum(-1) / _GIVEN_TURN**2

@@ -114,8 +114,8 @@ class PhaseSettings:
     renew_at: float = 2.0
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     mend: bool = True
-    """Whenever bounds are updated, tie parts of the shape that came loose to the body, and remove what the masks do not
-    vouch for: specks, and sheets that float where no ray is drawn."""
+    """Whenever bounds are updated, and at the end, tie parts of the shape that came loose to the body, and remove what
+    the masks do not vouch for: specks, and sheets that float where no ray is drawn."""
     mend_from: float = 0.3
     """Share of the phase from which that is done; before, limbs may still grow together."""
     rethink_at: tuple[float, ...] = ()

@@ -156,7 +156,7 @@ class Trainer:
             torch.nn.utils.clip_grad_norm_(group["params"], 10.0)
         self.optimiser.step()
         self.step_idx += 1
-        if self.done:
+        if self.done and s.lr_sdf > 0:
             self.refresh()  # what the last steps carved off is tied again: the next phase and the export see one body
         values["total"] = sum(values.values())
         return values

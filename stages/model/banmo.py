@@ -258,6 +258,11 @@ class Banmo(nn.Module):
         return model
 
     @property
+    def root_given(self) -> Tensor:
+        """(V,) bool: videos whose root poses somebody gave."""
+        return torch.tensor([video.root_given for video in self.videos], device=self.root_free.device)
+
+    @property
     def bounds(self) -> Tensor:
         """Canonical box (2, 3)."""
         return self.field.bounds

@@ -151,9 +151,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def _turned_onto(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """The least rotations (T, 3, 3) that take directions (T, 3) onto others."""
-    axis = np.cross(one, other)
-    angle = _angle_between(one, other)
-    return Rotation.from_rotvec(_unit(axis) * angle[:, None]).as_matrix()
+    turns = _unit(np.cross(one, other)) * _angle_between(one, other)[:, None]
+    return Rotation.from_rotvec(turns).as_matrix()
 
 
 def _frames_around(axis: np.ndarray, aside: np.ndarray, turns: np.ndarray) -> np.ndarray:
@@ -161,8 +160,6 @@ def _frames_around(axis: np.ndarray, aside: np.ndarray, turns: np.ndarray) -> np
 
     They start from the mean of `turns` (T, 3, 3), so that what is left to go around the axis does not wrap early.
     """
-    u, _, v = np.linalg.svd(turns.mean(0))
-    u[:, -1] *= np.linalg.det(u @ v)
-    middle = u @ v
+    middle = Rotation.from_matrix(turns).mean().as_matrix()
     start = np.broadcast_to(middle @ axis, aside.shape)
     return _turned_onto(start, aside) @ middle
