@@ -52,7 +52,9 @@ def model() -> Banmo:
     base[:, 2, 3] = 3.0
     bounds = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
     bones = Bones(0.4 * torch.randn(4, 3, generator=generator), torch.full((4, 3), -1.5), torch.zeros(4).long())
-    made = Banmo(Architecture(voxel=0.2), videos, base, bounds, bones, generator)
+    with torch.random.fork_rng(devices=[]):  # layers draw their first weights from torch's own generator
+        torch.manual_seed(0)
+        made = Banmo(Architecture(voxel=0.2), videos, base, bounds, bones, generator)
     made.surface = 0.5 * torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
     with torch.no_grad():
         made.body.head.out.bias[:3] = torch.tensor([0.3, 0.0, 0.0])  # the root bone turns, and all others with it
