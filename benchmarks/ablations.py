@@ -54,6 +54,7 @@ ROWS: dict[str, Row] = {
     "translation": Row(fit={"deformation": "translation"}),
     "dual-quaternions": Row(fit={"blending": "dual_quaternion"}),
     "no-features": Row(every=NO_FEATURES),
+    "features-register": Row(every={"feature_pull": 1.0, "weight_cycle_2d": 0.02}),
     "no-cycle-3d": Row(every={"weight_cycle_3d": 0.0}),
     "no-registration": Row(every={**NO_FEATURES, "weight_cycle_3d": 0.0}),
     "no-flow": Row(every={"weight_flow": 0.0}),

@@ -92,7 +92,7 @@ class FitSettings(PhaseSettings):
 
 @dataclass(frozen=True)
 class CorrectSettings(PhaseSettings):
-    """Phase 2: articulation alone, by matching pixels to the surface and back (2D cycle); the shape is held."""
+    """Phase 2: articulation alone; the shape is held. The paper's is led by `weight_cycle_2d`."""
 
     iterations: int = 80
     """Steps of gradient descent."""
@@ -108,8 +108,6 @@ class CorrectSettings(PhaseSettings):
     """Step size of the learned skinning correction."""
     beta_start: float = 0.012
     """Width of the Laplace density at the start (object about 2 long)."""
-    weight_cycle_2d: float = 0.1
-    """Matched point projected back onto its pixel (L_2D-cyc), in image sizes."""
     match_every: int = 1
     """Matching and the 2D cycle run every so many steps."""
     flow_steps: tuple[int, ...] = (1, 4)

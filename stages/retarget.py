@@ -79,6 +79,8 @@ class TrackSettings(ClipSettings):
     """Width of the Laplace density at the start (object about 2 long)."""
     weight_feature: float = 0.0
     """Rendered embedding against the pixel's features; only where one network spoke for both."""
+    feature_pull: float = 1.0
+    """Share of that term's pull that the motion gets: the embedding is frozen here."""
     weight_cycle_2d: float = 0.0
     """Matched point projected back onto its pixel (L_2D-cyc), in image sizes."""
     weight_cycle_3d: float = 0.0

@@ -230,8 +230,10 @@ def _correspondence(
     terms: dict[str, Tensor] = {}
     known = weight * (batch.features.abs().sum(-1) > 0.1)
     if settings.weight_feature:
-        # Rendered at the expected surface point. The point itself gets gradient too: features register the frames.
-        rendered = model.field.embedding(seen.surface.reshape(-1, 3)).reshape(batch.features.shape)
+        # Rendered at the expected surface point. Where the point itself gets gradient, features register the frames.
+        still = seen.surface.detach()
+        surface = still + settings.feature_pull * (seen.surface - still) if settings.feature_pull else still
+        rendered = model.field.embedding(surface.reshape(-1, 3)).reshape(batch.features.shape)
         terms["feature"] = settings.weight_feature * losses.feature_loss(rendered, batch.features, known)
     wanted = settings.weight_match or settings.weight_cycle_2d
     if not wanted or step % max(1, settings.match_every) or len(model.surface) == 0:

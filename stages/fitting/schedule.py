@@ -81,10 +81,13 @@ class PhaseSettings:
     spill_from: float = 0.2
     """Share of the phase from which they are."""
     weight_feature: float = 0.05
-    """Rendered embedding against the pixel's features."""
+    """Rendered embedding against the pixel's features: what the canonical embedding learns from."""
+    feature_pull: float = 0.0
+    """Share of that term's pull that shape, motion and root poses get, too (registration by embeddings); at 0 the
+    embedding alone learns."""
     weight_match: float = 0.0
     """Matched point against warped surface point (L_match)."""
-    weight_cycle_2d: float = 0.02
+    weight_cycle_2d: float = 0.0
     """Matched point projected back onto its pixel (L_2D-cyc), in image sizes."""
     weight_cycle_3d: float = 1.0
     """Backward then forward warp returns (L_3D-cyc)."""

@@ -148,6 +148,25 @@ def test_weights_scale_terms_and_zero_switches_them_off(seen: Scene) -> None:
     assert "flow" not in twice and twice["rgb"] == pytest.approx(once["rgb"], rel=1e-5)
 
 
+def test_features_teach_the_embedding_and_pull_the_rest_by_a_share(seen: Scene) -> None:
+    model, boxes = ready(model_of(seen, lambda x: ball(x) + 0.05))
+    stir(model, 0.2)
+    batch = draw(seen.observations, 3, 40, step_generator(1, 0))
+    pulled = [model.body.head.out.bias, model.root.head.out.bias, model.field.sdf_grids[0]]
+    gradients, learnt = [], []
+    for share in (0.0, 0.5, 1.0):
+        settings = tiny_settings(feature_pull=share)
+        term = objective.evaluate(model, boxes, batch, settings, 0.02, 0, step_generator(0, 0))["feature"]
+        found = torch.autograd.grad(term, [model.field.embedding_grid, *pulled], allow_unused=True)
+        learnt.append(found[0])
+        gradients.append(found[1:])
+    assert all(g is None for g in gradients[0]) and float(learnt[0].abs().sum()) > 0
+    assert torch.allclose(learnt[0], learnt[2], atol=1e-9)
+    for half, whole in zip(gradients[1], gradients[2], strict=True):
+        assert float(whole.abs().sum()) > 0
+        assert torch.allclose(2 * half, whole, rtol=1e-3, atol=1e-7)
+
+
 def test_untrusted_frames_pull_nowhere(seen: Scene) -> None:
     model, boxes = ready(model_of(seen, lambda x: ball(x) + 0.1))
     batch = draw(seen.observations, 3, 40, step_generator(1, 0))
