@@ -20,6 +20,7 @@ from stages.model.correspondence import soft_argmax
 from stages.model.fields import GridField
 
 _GIVEN_TURN, _GIVEN_SHIFT = 0.1, 0.03  # radians, units: how far given root poses that may move are off
+_SPILL_FREE_PX = 3.0  # as far beside the mask the surface may stick out: rays are drawn there, too
 _PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
 
 
@@ -196,7 +197,7 @@ def _outline(
     if spill and batch.beside is not None:
         scale = batch.beside_scale[..., None]
         beside_px = batch.beside.to(placed.dtype) / (BESIDE_UNITS * scale)
-        value = losses.spill_loss(placed * scale, beside_px, batch.weight, cap_px=farthest_px)
+        value = losses.spill_loss(placed * scale, beside_px, batch.weight, farthest_px, _SPILL_FREE_PX)
         terms["spill"] = settings.weight_spill * value
     return terms
 
