@@ -43,8 +43,11 @@ def model_surface(model: Banmo) -> Surface:
 def likeness(puppet: Puppet, surface: Surface) -> float:
     """Share of the surface that a rigid motion and a scale lay on the vertices its embedding names.
 
-    Near one if the embedding is this category's, whatever the model's build; hardly anything if it is another's.
+    Near one if the embedding is this category's, whatever the model's build; hardly anything if it is another's, and
+    nothing if the model was fitted without features.
     """
+    if not surface.features.any():
+        return 0.0
     rotation, scale, joint = lay(puppet, surface)
     vertex = (surface.features @ puppet.embedding.T).argmax(1)
     there = scale * (puppet.vertices[vertex] - puppet.joints[0]) @ rotation[0].T + joint

@@ -163,8 +163,8 @@ def tiny_settings(**changes: float) -> PhaseSettings:
     """Steps small enough for tests, every term switched on."""
     base = {
         "frames_per_step": 4, "pixels_per_frame": 24, "probe_samples": 16, "fine_samples": 8, "match_pixels": 24,
-        "match_every": 1, "lr_root": 1e-3, "lr_focal": 1e-3, "weight_match": 0.1, "weight_cycle_2d": 0.02, "feature_pull": 1.0,
-        "update_bounds_every": 3, "warmup_steps": 2,
+        "match_every": 1, "lr_root": 1e-3, "lr_focal": 1e-3, "weight_match": 0.1, "weight_cycle_2d": 0.02,
+        "feature_pull": 1.0, "update_bounds_every": 3, "warmup_steps": 2,
     }  # fmt: skip
     return PhaseSettings(**{**base, **changes})
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,6 +23,7 @@ from stages.retargeting.fitting import (
     weak_misfit,
 )
 from stages.retargeting.handing import hand_on, hang
+from stages.retargeting.matching import ALIKE, likeness
 from stages.retargeting.puppet import Puppet, skinned, vertex_turns
 from stages.retargeting.seeing import look
 
@@ -181,6 +184,15 @@ def test_the_puppet_finds_its_way_onto_a_model(animal: Puppet) -> None:
     found = fit_surface(animal, surface, Effort(rounds=8, steps=20, rest=0.0005, learning_rate=0.03))
     assert float(found.misfit) < 0.015
     assert limb_error_deg(animal, found, truth, LEGS) < 4
+
+
+def test_an_embedding_tells_whether_the_model_is_of_the_category(animal: Puppet) -> None:
+    _, surface = body_of(animal)
+    assert likeness(animal, surface) > 0.95
+    generator = torch.Generator().manual_seed(0)
+    mixed = surface.features[torch.randperm(len(surface.features), generator=generator)]
+    assert likeness(animal, replace(surface, features=mixed)) < ALIKE
+    assert likeness(animal, replace(surface, features=torch.zeros_like(mixed))) == 0, "fitted without features"
 
 
 def test_a_motion_handed_on_turns_limbs_as_the_subject_does_at_the_models_own_lengths(animal: Puppet) -> None:
