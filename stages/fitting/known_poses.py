@@ -56,22 +56,38 @@ def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Obse
     """
     cost = torch.zeros(len(frames), len(shapes))
     for t, frame in enumerate(frames.tolist()):
-        if float(observations.frame_weight[frame]) <= 0:
-            continue
-        scale = float(observations.silhouette_scale[frame])
-        outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
-        if len(wanted) == 0:  # too small to be seen at the size of the silhouettes
-            continue
-        placed = transform(poses[t], shapes.reshape(-1, 3))
-        pixels = project(intrinsics[t], placed).reshape(*shapes.shape[:2], 2) * scale
-        height, width = outside.shape
+        if float(observations.frame_weight[frame]) > 0:
+            cost[t] = misfit_in_frame(shapes, poses[t : t + 1], intrinsics[t], observations, frame)
+    return cost
+
+
+def misfit_in_frame(
+    shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frame: int, chunk: int = 512
+) -> Tensor:
+    """How badly each known shape (K, N, 3) fits one frame: (K,), in object sizes; zero is perfect, or nothing is seen.
+
+    Args:
+        poses: (K, 4, 4) camera_from_object of each shape, or (1, 4, 4) of all.
+        intrinsics: (3, 3) pixels.
+        chunk: shapes that are looked at at once.
+    """
+    scale = float(observations.silhouette_scale[frame])
+    outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
+    if len(wanted) == 0:  # too small to be seen at the size of the silhouettes
+        return torch.zeros(len(shapes))
+    height, width = outside.shape
+    far, some = torch.from_numpy(outside), torch.from_numpy(wanted)
+    size = max(8.0, float(np.sqrt((outside == 0).sum())))
+    poses = poses.expand(len(shapes), 4, 4)
+    found = []
+    for start in range(0, len(shapes), chunk):
+        points = transform(poses[start : start + chunk], shapes[start : start + chunk])
+        pixels = project(intrinsics, points) * scale
         column = pixels[..., 0].floor().long().clamp(0, width - 1)
         row = pixels[..., 1].floor().long().clamp(0, height - 1)
-        beyond = torch.from_numpy(outside)[row, column].mean(1)
-        bare = torch.cdist(torch.from_numpy(wanted)[None].expand(len(shapes), -1, -1), pixels).amin(-1)
-        size = max(8.0, float(np.sqrt((outside == 0).sum())))
-        cost[t] = (beyond + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size
-    return cost
+        bare = torch.cdist(some[None].expand(len(pixels), -1, -1), pixels).amin(-1)
+        found.append((far[row, column].mean(1) + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size)
+    return torch.cat(found)
 
 
 def best_sequence(cost: Tensor, jump: Tensor) -> Tensor:

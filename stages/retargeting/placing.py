@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.fitting.known_poses import best_sequence, mask_distance, spread
+from stages.fitting.known_poses import best_sequence, misfit_in_frame, spread
 from stages.fitting.observations import Observations
-from stages.geometry.cameras import project, transform
+from stages.geometry.cameras import project
 from stages.geometry.rotations import geodesic_angle, matrix_to_quaternion, quaternion_to_matrix
 
 _TURN_PRICE = 0.08
@@ -94,7 +94,7 @@ def register(
     for frame in chosen.tolist():
         box = torch.from_numpy(np.asarray(boxes_px[frame], np.float32))
         pose = place_in_box(candidates, rotations, box, intrinsics)
-        cost = _one_frame(candidates, pose, intrinsics, observations, frame)
+        cost = misfit_in_frame(candidates, pose, intrinsics, observations, frame)
         best = cost.reshape(len(look), len(shapes)).min(1)
         costs.append(best.values)
         poses.append(pose.reshape(len(look), len(shapes), 4, 4)[torch.arange(len(look)), best.indices])
@@ -177,27 +177,8 @@ def _turned_cost(
             continue
         box = torch.from_numpy(np.asarray(boxes_px[frame], np.float32))
         pose = place_in_box(shapes, rotation.expand(len(shapes), 3, 3), box, intrinsics)
-        rows.append(_one_frame(shapes, pose, intrinsics, observations, frame))
+        rows.append(misfit_in_frame(shapes, pose, intrinsics, observations, frame))
     return torch.stack(rows)
-
-
-def _one_frame(
-    shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frame: int, chunk: int = 512
-) -> Tensor:
-    scale = float(observations.silhouette_scale[frame])
-    outside, wanted = mask_distance(observations.silhouettes[frame].numpy())
-    height, width = outside.shape
-    far, some = torch.from_numpy(outside), torch.from_numpy(wanted)
-    size = max(8.0, float(np.sqrt((outside == 0).sum())))
-    found = []
-    for start in range(0, len(shapes), chunk):
-        points = transform(poses[start : start + chunk], shapes[start : start + chunk])
-        pixels = project(intrinsics, points) * scale
-        column = pixels[..., 0].floor().long().clamp(0, width - 1)
-        row = pixels[..., 1].floor().long().clamp(0, height - 1)
-        bare = torch.cdist(some[None].expand(len(pixels), -1, -1), pixels).amin(-1)
-        found.append((far[row, column].mean(1) + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size)
-    return torch.cat(found)
 
 
 def _between(poses: Tensor, known: Tensor, wanted: Tensor) -> Tensor:
