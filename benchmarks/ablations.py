@@ -33,6 +33,7 @@ class Row:
     """What one row changes."""
 
     fit: dict[str, Any] = field(default_factory=dict)
+    correct: dict[str, Any] = field(default_factory=dict)
     every: dict[str, Any] = field(default_factory=dict)
     """Settings of all phases."""
     clips: int = 5
@@ -54,7 +55,7 @@ ROWS: dict[str, Row] = {
     "translation": Row(fit={"deformation": "translation"}),
     "dual-quaternions": Row(fit={"blending": "dual_quaternion"}),
     "no-features": Row(every=NO_FEATURES),
-    "features-register": Row(every={"feature_pull": 1.0, "weight_cycle_2d": 0.02}),
+    "features-register": Row(every={"feature_pull": 1.0, "weight_cycle_2d": 0.02}, correct={"weight_cycle_2d": 0.1}),
     "no-cycle-3d": Row(every={"weight_cycle_3d": 0.0}),
     "no-registration": Row(every={**NO_FEATURES, "weight_cycle_3d": 0.0}),
     "no-flow": Row(every={"weight_flow": 0.0}),
@@ -78,7 +79,11 @@ ROWS: dict[str, Row] = {
 def changed(row: Row, phases: Phases) -> Phases:
     """The settings of a row, from those of the full one."""
     fit, correct, refine = phases
-    return replace(fit, **row.every, **row.fit), replace(correct, **row.every), replace(refine, **row.every)
+    return (
+        replace(fit, **{**row.every, **row.fit}),
+        replace(correct, **{**row.every, **row.correct}),
+        replace(refine, **row.every),
+    )
 
 
 def main(
