@@ -10,27 +10,23 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from training.shapes import an_end, field, sometimes
 from training.wardrobe import Random
 
 
-def corrupted(mask: Tensor, image: Tensor, draw: Random) -> Tensor:
-    """A rough probability (B, 1, S, S) of the object whose true coverage is `mask`, in pictures (B, 3, S, S) sRGB."""
+def corrupted(mask: Tensor, image: Tensor, draw: Random, hidden: Tensor | None = None) -> Tensor:
+    """A rough probability (B, 1, S, S) of the object whose true coverage is `mask`, in pictures (B, 3, S, S) sRGB.
+
+    `hidden` (B, 1, S, S) is where the object looks like its background (`Batch.hidden`).
+    """
     rough = _without_ends(mask, draw)
+    if hidden is not None:
+        rough = _without_hidden(rough, hidden, draw)
     rough = _by_colour(rough, image, draw)
     rough = _gaps_filled(rough, draw)
     rough = _blotted(rough, draw)
     rough = _coarse(rough, draw)
     return _as_probability(rough, draw)
-
-
-def _sometimes(count: int, chance: float, draw: Random) -> Tensor:
-    return draw.chance(count, chance)[:, None, None, None]
-
-
-def _field(count: int, cells: int, side: int, draw: Random) -> Tensor:
-    """(B, 1, S, S) smooth noise of about unit spread."""
-    few = draw.normal(count, 1, cells, cells)
-    return functional.interpolate(few, (side, side), mode="bicubic", align_corners=False)
 
 
 def _resized(maps: Tensor, side: int) -> Tensor:
@@ -42,21 +38,19 @@ def _resized(maps: Tensor, side: int) -> Tensor:
 
 def _without_ends(mask: Tensor, draw: Random) -> Tensor:
     """What sticks out furthest in one to three directions is faint: feet, hands, a tail, a head."""
-    count, side = len(mask), mask.shape[-1]
-    at = torch.linspace(-1, 1, side)
-    y, x = at[:, None].expand(side, side), at[None].expand(side, side)
     out = mask
     for k in range(3):
-        turn = draw.uniform(count, 1, 1, 1, high=6.2832)
-        down = torch.full_like(turn, 1.5708) + 0.25 * draw.normal(count, 1, 1, 1)
-        turn = torch.where(_sometimes(count, 0.6 if k == 0 else 0.2, draw), down, turn)
-        along = x * torch.cos(turn) + y * torch.sin(turn) + 0.06 * _field(count, 8, side, draw)
-        reach = torch.where(mask > 0.5, along, -9.0).amax((2, 3), keepdim=True)
-        least = torch.where(mask > 0.5, along, 9.0).amin((2, 3), keepdim=True)
-        end = along > reach - draw.uniform(count, 1, 1, 1, low=0.02, high=0.17) * (reach - least).clamp_min(0)
-        left = draw.uniform(count, 1, 1, 1, high=0.5)
-        out = torch.where(end & _sometimes(count, 0.6 / (k + 1), draw), out * left, out)
+        end = an_end(mask, 0.6 if k == 0 else 0.2, 0.17, draw)
+        left = draw.uniform(len(mask), 1, 1, 1, high=0.5)
+        out = torch.where(end & sometimes(len(mask), 0.6 / (k + 1), draw), out * left, out)
     return out
+
+
+def _without_hidden(rough: Tensor, hidden: Tensor, draw: Random) -> Tensor:
+    """What looks like its background is mostly lost, and wholly so half the time."""
+    count = len(rough)
+    left = draw.uniform(count, 1, 1, 1, high=0.4) * sometimes(count, 0.5, draw)
+    return torch.where((hidden > 0.5) & sometimes(count, 0.8, draw), rough * left, rough)
 
 
 def _by_colour(rough: Tensor, image: Tensor, draw: Random) -> Tensor:
@@ -66,10 +60,10 @@ def _by_colour(rough: Tensor, image: Tensor, draw: Random) -> Tensor:
     colour = image[torch.arange(count), :, rows, columns][:, :, None, None]
     alike = (image - colour).abs().sum(1, keepdim=True) < draw.uniform(count, 1, 1, 1, low=0.1, high=0.4)
     alike = functional.avg_pool2d(alike.float(), 5, 1, 2) > 0.5
-    here = _field(count, 4, side, draw) > 0.0
+    here = field(count, 4, side, draw) > 0.0
     near = _resized(functional.max_pool2d(_resized(rough, side // 4), 7, 1, 3), side) > 0.3
-    lost = alike & here & (rough > 0.5) & _sometimes(count, 0.35, draw)
-    won = alike & here & near & (rough < 0.5) & _sometimes(count, 0.3, draw)
+    lost = alike & here & (rough > 0.5) & sometimes(count, 0.35, draw)
+    won = alike & here & near & (rough < 0.5) & sometimes(count, 0.3, draw)
     level = draw.uniform(count, 1, 1, 1, high=0.45)
     return torch.where(lost, level, torch.where(won, 1 - level, rough))
 
@@ -82,18 +76,18 @@ def _gaps_filled(rough: Tensor, draw: Random) -> Tensor:
         pad = size // 2
         wide = functional.max_pool2d(half, size, 1, pad)
         closed = _resized(-functional.max_pool2d(-wide, size, 1, pad), side)
-        rough = torch.where(_sometimes(count, chance, draw), torch.maximum(rough, closed), rough)
+        rough = torch.where(sometimes(count, chance, draw), torch.maximum(rough, closed), rough)
     opened = _resized(functional.max_pool2d(-functional.max_pool2d(-half, 3, 1, 1), 3, 1, 1), side)
-    return torch.where(_sometimes(count, 0.12, draw), torch.minimum(rough, 0.3 * rough + 0.7 * opened), rough)
+    return torch.where(sometimes(count, 0.12, draw), torch.minimum(rough, 0.3 * rough + 0.7 * opened), rough)
 
 
 def _blotted(rough: Tensor, draw: Random) -> Tensor:
     """Pieces lost and stray pieces, anywhere."""
     count, side = len(rough), rough.shape[-1]
-    broad = _field(count, 6, side, draw)
+    broad = field(count, 6, side, draw)
     level = draw.uniform(count, 1, 1, 1, high=0.45)
-    lost = (broad > 1.2) & _sometimes(count, 0.25, draw)
-    stray = (broad < -1.5) & _sometimes(count, 0.25, draw)
+    lost = (broad > 1.2) & sometimes(count, 0.25, draw)
+    stray = (broad < -1.5) & sometimes(count, 0.25, draw)
     return torch.where(lost, rough * level, torch.where(stray, torch.maximum(rough, 1 - level), rough))
 
 
@@ -103,13 +97,13 @@ def _coarse(rough: Tensor, draw: Random) -> Tensor:
     out = rough
     for cells, chance in ((side // 2, 0.5), (side // 4, 0.4), (side // 7, 0.25)):
         seen = _resized(_resized(rough, cells), side)
-        out = torch.where(_sometimes(count, chance, draw), seen, out)
+        out = torch.where(sometimes(count, chance, draw), seen, out)
     wide = functional.avg_pool2d(functional.pad(out, (3, 3, 3, 3)), 7, 1)
-    halo = draw.uniform(count, 1, 1, 1, low=-0.3, high=0.4) + draw.uniform(count, 1, 1, 1, high=0.3) * _field(
+    halo = draw.uniform(count, 1, 1, 1, low=-0.3, high=0.4) + draw.uniform(count, 1, 1, 1, high=0.3) * field(
         count, 16, side, draw
     )
     moved = (wide + halo * (4 * wide * (1 - wide))).clamp(0, 1)
-    return torch.where(_sometimes(count, 0.7, draw), moved, out)
+    return torch.where(sometimes(count, 0.7, draw), moved, out)
 
 
 def _as_probability(rough: Tensor, draw: Random) -> Tensor:
@@ -117,4 +111,4 @@ def _as_probability(rough: Tensor, draw: Random) -> Tensor:
     count = len(rough)
     logit = torch.log((rough + 0.01) / (1.01 - rough)) * draw.uniform(count, 1, 1, 1, low=0.5, high=1.6)
     soft = torch.sigmoid(logit + 0.3 * draw.normal(count, 1, 1, 1))
-    return torch.where(_sometimes(count, 0.25, draw), (rough > 0.5).float(), soft)
+    return torch.where(sometimes(count, 0.25, draw), (rough > 0.5).float(), soft)

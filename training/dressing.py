@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from training.shapes import an_end, sometimes
 from training.wardrobe import Bank, Random, coloured
 
 LABEL_SHARE = 4
@@ -27,6 +28,7 @@ class Batch:
     view: Tensor  # (B, 3) radians
     present: Tensor  # (B,) bool: the object is in the picture
     shown: Tensor  # (B, 1, S, S) what a mask given as a prompt would cover: the object, or a thing in its place
+    hidden: Tensor  # (B, 1, S, S) where the object was given the looks of its background
 
     def to(self, device: torch.device) -> Batch:
         """The same on another device."""
@@ -34,12 +36,13 @@ class Batch:
 
 
 def dress(
-    banks: list[Bank], things: Bank, backgrounds: Tensor, count: int, draw: Random, hard: float = 1.0
-) -> list[Batch]:
+    banks: list[Bank], things: Bank, backgrounds: Tensor, count: int, draw: Random, hard: float = 1.0,
+    hide: float = 0.0,
+) -> list[Batch]:  # fmt: skip
     """`count` fresh pictures of each category.
 
     `things` stand about in the background, and now and then in the object's place. `backgrounds` (M, 3, S', S') uint8;
-    `hard` in 0..1 scales the faults.
+    `hard` in 0..1 scales the faults; with the chance `hide` an end of the object has the colour of what lies behind it.
     """
     dressed = [coloured(bank, count, draw) for bank in banks]
     lumps = coloured(things, (count + 1) // 2, draw)[0].repeat(2, 1, 1, 1)[:count]
@@ -47,7 +50,7 @@ def dress(
     for k, (bank, (rgba, vertex, view)) in enumerate(zip(banks, dressed, strict=True)):
         foreign = draw.chance(count, 0.35)[:, None, None, None]
         other = torch.where(foreign, dressed[(k + 1) % len(dressed)][0], lumps.roll(k, 0))
-        out.append(_pictured(bank, rgba, vertex, view, other, lumps, backgrounds, draw, hard))
+        out.append(_pictured(bank, rgba, vertex, view, other, lumps, backgrounds, draw, hard, hide))
     return out
 
 
@@ -75,6 +78,7 @@ def _pictured(
     backgrounds: Tensor,
     draw: Random,
     hard: float,
+    hide: float,
 ) -> Batch:
     count, side = len(rgba), rgba.shape[-1]
     few = side // LABEL_SHARE
@@ -109,15 +113,18 @@ def _pictured(
     back = back * (1 - another[:, 3:]) + another[:, :3]
     alpha = seen[:, 3:]
     back = back * _shadow(alpha, draw)
-    image = back * (1 - alpha) + seen[:, :3]
+    colour, hidden = seen[:, :3], torch.zeros_like(alpha)
+    if hide > 0:
+        colour, hidden = _hidden(colour, alpha, back, hide, draw)
+    image = back * (1 - alpha) + colour
     image, alpha = _occlude(image, alpha, backgrounds, draw, hard)
     shown = (alpha > 0.5).float()
     mask = shown * present[:, None, None, None]
-    hidden = functional.interpolate(alpha, (few, few), mode="area")[:, 0] < 0.5
-    label = torch.where(hidden | (label >= nothing) | ~present[:, None, None], -1, label)
+    covered = functional.interpolate(alpha, (few, few), mode="area")[:, 0] < 0.5
+    label = torch.where(covered | (label >= nothing) | ~present[:, None, None], -1, label)
     angles = torch.stack([view[:, 0] * flip, view[:, 1], view[:, 2] * flip], 1)
     visible = mask.mean((1, 2, 3)) > 0.015
-    return Batch(_camera(image, draw, hard), mask, label, angles, present & visible, shown)
+    return Batch(_camera(image, draw, hard), mask, label, angles, present & visible, shown, hidden)
 
 
 def _behind(backgrounds: Tensor, count: int, side: int, draw: Random) -> Tensor:
@@ -143,6 +150,25 @@ def _shadow(alpha: Tensor, draw: Random) -> Tensor:
     cast = functional.avg_pool2d(functional.grid_sample(alpha, grid, align_corners=False), 7, 1, 3)
     strength = draw.uniform(count, 1, 1, 1, high=0.65) * draw.chance(count, 0.6)[:, None, None, None]
     return 1 - strength * cast
+
+
+def _hidden(colour: Tensor, alpha: Tensor, back: Tensor, chance: float, draw: Random) -> tuple[Tensor, Tensor]:
+    """Dark shoes on dark ground: now and then an end of the object takes the colour of what is behind and around it.
+
+    Its own light and shade stay. Colours (B, 3, S, S) are premultiplied; also returns where, (B, 1, S, S).
+    """
+    count, side = len(alpha), alpha.shape[-1]
+    end = an_end(alpha, 0.75, 0.2, draw) & sometimes(count, chance, draw)
+    cells = side // 16
+    near = functional.interpolate(back, (cells, cells), mode="area")
+    near = functional.interpolate(near, (side, side), mode="bilinear", align_corners=False)
+    near = near * draw.uniform(count, 1, 1, 1, low=0.8, high=1.2) + 0.02 * draw.normal(count, 3, 1, 1)
+    inside = end.float() * alpha
+    light = colour.mean(1, keepdim=True) / alpha.clamp_min(1e-3)
+    mean = (light * inside).sum((2, 3), keepdim=True) / inside.sum((2, 3), keepdim=True).clamp_min(1)
+    shade = (light / mean.clamp_min(0.02)).clamp(0.4, 1.7) ** draw.uniform(count, 1, 1, 1, low=0.2, high=1.0)
+    share = draw.uniform(count, 1, 1, 1, low=0.75, high=1.0) * end
+    return colour + share * (alpha * (near * shade).clamp(0, 1) - colour), (inside > 0.5).float()
 
 
 def _occlude(image: Tensor, alpha: Tensor, backgrounds: Tensor, draw: Random, hard: float) -> tuple[Tensor, Tensor]:

@@ -26,12 +26,16 @@ from synthetic.backgrounds import backgrounds
 from training.corruption import corrupted
 from training.dressing import dress
 from training.network import CATEGORIES, IMAGENET_MEAN, IMAGENET_STD, Network
+from training.revive import calibrate, revive
 from training.train import load_bank, read_state
 from training.wardrobe import Bank, Random
 
 log = logging.getLogger(__name__)
 KEEP_SHARE = 0.995
+CALIBRATION_BATCHES = 12
 LOG_EVERY, KEEP_EVERY = 10, 50
+HIDE = 0.7
+"""Share of pictures in which an end of the object looks like its background."""
 
 
 class Refiner(nn.Module):
@@ -80,11 +84,10 @@ def examples(
     banks: list[Bank], things: Bank, photos: Tensor, count: int, draw: Random
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fresh pictures (B, 3, S, S), their true masks and rough ones (B, 1, S, S); those with an object in them."""
-    batches = dress(banks, things, photos, count, draw, 0.7)
-    image, mask = torch.cat([b.image for b in batches]), torch.cat([b.mask for b in batches])
+    batches = dress(banks, things, photos, count, draw, 0.7, HIDE)
     shown = torch.cat([b.present for b in batches])
-    image, mask = image[shown], mask[shown]
-    return image, mask, corrupted(mask, image, draw)
+    image, mask, hidden = (torch.cat([getattr(b, n) for b in batches])[shown] for n in ("image", "mask", "hidden"))
+    return image, mask, corrupted(mask, image, draw, hidden)
 
 
 def overlap(found: Tensor, truth: Tensor) -> float:
@@ -99,7 +102,7 @@ def train(
     """`steps` more steps, of `total` that the learning rate is planned for; returns the averaged network."""
     out.mkdir(parents=True, exist_ok=True)
     kept = out / "refine.safetensors"
-    network = Refiner.from_categories(read_state(start)["network"])
+    network = _begun(start, banks, things, photos, batch, seed)
     averaged = Refiner()
     averaged.load_state_dict(network.state_dict())
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.02, betas=(0.9, 0.98))
@@ -141,6 +144,18 @@ def train(
                 _keep(kept, network, averaged, optimiser, step + 1)
     _keep(kept, network, averaged, optimiser, first + steps)
     return averaged
+
+
+def _begun(start: Path, banks: list[Bank], things: Bank, photos: Tensor, batch: int, seed: int) -> Refiner:
+    """From the categories' trained networks, or from a refiner as it was exported."""
+    if start.suffix != ".onnx":
+        return Refiner.from_categories(read_state(start)["network"])
+    made = Refiner()
+    revive(made.trunk, made.head, start)
+    draw = Random(seed)
+    pictures = [examples(banks, things, photos, batch, draw) for _ in range(CALIBRATION_BATCHES)]
+    calibrate(made, [refiner_input(image, rough) for image, _, rough in pictures])
+    return made
 
 
 def _average(averaged: nn.Module, network: nn.Module, keep_share: float) -> None:
@@ -201,7 +216,7 @@ def main(
     Args:
         out: Folder for the state and the log.
         bank: Folder of pictures of 192 px: quadrupeds, humans and things.
-        start: The categories' trained networks.
+        start: The categories' trained networks, or a refiner as it was exported (.onnx) to go on from.
         steps: How many steps now.
         total: How many steps in all; the learning rate has fallen by then.
         seed: Of everything random.

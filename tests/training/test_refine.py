@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -13,9 +14,11 @@ import torch
 from synthetic.backgrounds import backgrounds
 from synthetic.bank import main as write_bank
 from training.corruption import corrupted
+from training.dressing import _hidden, dress
 from training.export import refiner_model
 from training.network import CATEGORIES, Network
-from training.refine import Refiner, averaged_refiner, examples, overlap, refining_loss, train
+from training.refine import Refiner, averaged_refiner, examples, overlap, refiner_input, refining_loss, train
+from training.revive import calibrate, revive
 from training.train import keep, load_bank
 from training.wardrobe import Bank, Random
 
@@ -82,3 +85,59 @@ def test_it_begins_as_the_mean_of_the_categories_masks() -> None:
         refiner.head.weight[:, :, 1, 1] = network.mask.weight.mean(0)[None, :, 0, 0]
         x = torch.randn(1, 4, 32, 48, generator=torch.Generator().manual_seed(1))
         np.testing.assert_allclose(refiner(x)[:, ::2, ::2], network(x)["mask"].mean(1), atol=1e-4)
+
+
+def test_an_end_that_looks_like_its_background_is_hard_to_see_and_mostly_lost(
+    banks: list[Bank], photos: torch.Tensor
+) -> None:
+    plain, hiding = (dress(banks[:2], banks[2], photos, 24, Random(2), 0.7, hide) for hide in (0.0, 1.0))
+    assert all(not b.hidden.any() for b in plain)
+    for batch in hiding:
+        there = batch.hidden[batch.present].amax((1, 2, 3))
+        assert there.mean() > 0.8  # some ends are too short to count a pixel, or behind something
+    mask = torch.cat([b.mask for b in hiding])
+    image = torch.cat([b.image for b in hiding])
+    hidden = torch.cat([b.hidden for b in hiding]) * mask
+    told, untold = (corrupted(mask, image, Random(7), h)[hidden > 0.5].mean() for h in (hidden, None))
+    assert told < 0.6 * untold
+
+
+def _contrast(batch_colour: torch.Tensor, back: torch.Tensor, where: torch.Tensor) -> float:
+    return float(((batch_colour - back).abs().mean(1, keepdim=True) * where).sum() / where.sum())
+
+
+def test_what_is_hidden_takes_the_colour_behind_it_and_keeps_its_coverage() -> None:
+    colour, alpha = torch.zeros(4, 3, 64, 64), torch.zeros(4, 1, 64, 64)
+    alpha[:, :, 8:56, 24:40] = 1
+    colour[:, 0, 8:56, 24:40] = 0.9
+    back = torch.full((4, 3, 64, 64), 0.3)
+    changed, hidden = _hidden(colour, alpha, back, 1.0, Random(0))
+    assert hidden.sum() > 0
+    assert _contrast(changed, back, hidden) < 0.5 * _contrast(colour, back, hidden)
+    assert torch.equal(changed * (1 - hidden), colour * (1 - hidden))
+    assert not (changed * (1 - alpha)).any()
+
+
+def test_an_exported_refiner_can_be_trained_on(banks: list[Bank], photos: torch.Tensor, tmp_path: Path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        made = Refiner()
+    image, _, rough = examples(banks[:2], banks[2], photos, 8, Random(1))
+    x = refiner_input(image, rough)
+    made.train()
+    for _ in range(40):
+        made(x)  # normalisation that means something
+    made.eval()
+    path = tmp_path / "refine.onnx"
+    path.write_bytes(refiner_model(made, {"made_by": "a test"}).SerializeToString())
+    again = Refiner()
+    revive(again.trunk, again.head, path)
+    with torch.no_grad():
+        wanted = made(x)
+        np.testing.assert_allclose(again.eval()(x), wanted, atol=0.02)
+        calibrate(again, [x])
+        np.testing.assert_allclose(again(x), wanted, atol=0.02)
+        np.testing.assert_allclose(again.train()(x), wanted, atol=0.05)  # the batch it was calibrated on
+    with pytest.raises(ValueError, match="holds 0 weights"):
+        path.write_bytes(onnx.ModelProto().SerializeToString())
+        revive(again.trunk, again.head, path)
