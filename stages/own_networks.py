@@ -17,7 +17,7 @@ DIGESTS = {
     "posenet-human.onnx": "d2e2a25b8e9e82b84e6d616471c5d07078b2b0560cad0e0a6e87df25ce17e866",
     "quadruped.npz": "08131d368bb1b29ac53b50747c55186bab028996b8e0a1b92598f7c03aaa02ed",
     "human.npz": "95b6eebf697fe08a808e36dd866b8130d306c1b612b96f3e7979c2fc18e4e99e",
-    "refine.onnx": "a79cc62e7cb1a090a676d33771bf0163e4bb30714ac12847e3ccf28dbd5badf9",
+    "refine.onnx": "17f7c6e0c7398a56703b091661eea1eee1147bd68a12c0da2697fc367e26d4f2",
     "quadruped-skeleton.npz": "aabfb977e9d3dab9fc71b28930737a8da2837fa47dfe0ac5b703ca83574b950a",
     "human-skeleton.npz": "a2f5140035bcfba243a3ac916b55fa8c415e76c00904a8233e49cd5872d2d111",
 }
