@@ -116,10 +116,10 @@ train-networks: $(STAMP)  ## train the shipped networks anew: renderings, MINUTE
 	$(PYTHON) -m synthetic.bank build/bank --category thing --bodies 120 --views 25 --seed 1
 	$(PYTHON) -m training.train build/networks --bank build/bank --minutes "$(MINUTES)" --seed 0
 	$(PYTHON) -m training.export build/networks/state.safetensors build/networks/weights
-	$(PYTHON) -m synthetic.bank build/bank192 --category quadruped --bodies 120 --views 40 --seed 11 --side-px 192
-	$(PYTHON) -m synthetic.bank build/bank192 --category human --bodies 120 --views 40 --seed 11 --side-px 192
-	$(PYTHON) -m synthetic.bank build/bank192 --category thing --bodies 40 --views 30 --seed 11 --side-px 192
-	$(PYTHON) -m training.refine build/networks --bank build/bank192 --start build/networks/state.safetensors --steps 7200 --total 7200 --seed 0
+	$(PYTHON) -m synthetic.bank build/bank192 --category quadruped --bodies 60 --views 30 --seed 11 --side-px 192
+	$(PYTHON) -m synthetic.bank build/bank192 --category human --bodies 60 --views 30 --seed 11 --side-px 192
+	$(PYTHON) -m synthetic.bank build/bank192 --category thing --bodies 20 --views 30 --seed 11 --side-px 192
+	$(PYTHON) -m training.refine build/networks --bank build/bank192 --start build/networks/state.safetensors --seed 0
 	$(PYTHON) -m training.export build/networks/refine.safetensors build/networks/weights
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code

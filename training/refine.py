@@ -34,8 +34,6 @@ log = logging.getLogger(__name__)
 KEEP_SHARE = 0.995
 CALIBRATION_BATCHES = 12
 LOG_EVERY, KEEP_EVERY = 10, 50
-HIDE = 0.7
-"""Share of pictures in which an end of the object looks like its background."""
 
 
 class Refiner(nn.Module):
@@ -81,13 +79,16 @@ def refining_loss(logits: Tensor, mask: Tensor) -> Tensor:
 
 
 def examples(
-    banks: list[Bank], things: Bank, photos: Tensor, count: int, draw: Random
+    banks: list[Bank], things: Bank, photos: Tensor, count: int, draw: Random, hide: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fresh pictures (B, 3, S, S), their true masks and rough ones (B, 1, S, S); those with an object in them."""
-    batches = dress(banks, things, photos, count, draw, 0.7, HIDE)
+    """Fresh pictures (B, 3, S, S), their true masks and rough ones (B, 1, S, S); those with an object in them.
+
+    In a share `hide` of them an end of the object looks like its background.
+    """
+    batches = dress(banks, things, photos, count, draw, 0.7, hide)
     shown = torch.cat([b.present for b in batches])
     image, mask, hidden = (torch.cat([getattr(b, n) for b in batches])[shown] for n in ("image", "mask", "hidden"))
-    return image, mask, corrupted(mask, image, draw, hidden)
+    return image, mask, corrupted(mask, image, draw, hidden if hide > 0 else None)
 
 
 def overlap(found: Tensor, truth: Tensor) -> float:
@@ -97,12 +98,12 @@ def overlap(found: Tensor, truth: Tensor) -> float:
 
 def train(
     banks: list[Bank], things: Bank, photos: Tensor, out: Path, start: Path, steps: int, seed: int,
-    batch: int = 8, rate: float = 8e-4, total: int = 1200,
+    batch: int = 8, rate: float = 8e-4, total: int = 1200, hide: float = 0.0,
 ) -> Refiner:  # fmt: skip
     """`steps` more steps, of `total` that the learning rate is planned for; returns the averaged network."""
     out.mkdir(parents=True, exist_ok=True)
     kept = out / "refine.safetensors"
-    network = _begun(start, banks, things, photos, batch, seed)
+    network = Refiner() if kept.exists() else _begun(start, banks, things, photos, batch, seed)
     averaged = Refiner()
     averaged.load_state_dict(network.state_dict())
     optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=0.02, betas=(0.9, 0.98))
@@ -120,7 +121,7 @@ def train(
             falling = 0.5 + 0.5 * float(np.cos(np.pi * max(share - 0.3, 0) / 0.7))
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (step + 1) / 60) * max(falling, 0.02)
-            image, mask, rough = examples(banks, things, photos, batch, draw)
+            image, mask, rough = examples(banks, things, photos, batch, draw, hide)
             inputs = refiner_input(image, rough).contiguous(memory_format=torch.channels_last)
             with torch.autocast("cpu", torch.bfloat16):
                 logits = network(inputs)
@@ -208,6 +209,7 @@ def main(
     total: int = 1200,
     seed: int = 0,
     batch: int = 8,
+    hide: float = 0.0,
     photos: int = 1000,
     threads: int = 1,
 ) -> None:
@@ -221,6 +223,7 @@ def main(
         total: How many steps in all; the learning rate has fallen by then.
         seed: Of everything random.
         batch: Pictures a step and category.
+        hide: Share of pictures in which an end of the object looks like its background; 0 made the shipped refiner.
         photos: How many backgrounds to make.
         threads: CPU threads.
     """
@@ -232,7 +235,7 @@ def main(
         np.save(cached, backgrounds(np.random.default_rng(seed), photos, 192), allow_pickle=False)
     pictures = torch.from_numpy(np.load(cached, allow_pickle=False)).permute(0, 3, 1, 2).contiguous()
     banks = [load_bank(bank, name) for name in CATEGORIES]
-    train(banks, load_bank(bank, "thing"), pictures, out, start, steps, seed, batch, total=total)
+    train(banks, load_bank(bank, "thing"), pictures, out, start, steps, seed, batch, total=total, hide=hide)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,10 @@ def revive(trunk: Network, head: nn.Conv2d, path: Path) -> None:
                 assert conv.bias is not None
                 conv.bias.copy_(shift)
             else:
-                _set(norm, torch.zeros_like(shift), torch.ones_like(shift), shift)
+                norm.running_mean.zero_()  # type: ignore[union-attr]
+                norm.running_var.fill_(1 - norm.eps)  # type: ignore[union-attr]
+                norm.weight.fill_(1)
+                norm.bias.copy_(shift)
 
 
 def calibrate(network: nn.Module, batches: list[Tensor]) -> None:
@@ -84,10 +87,3 @@ def _layers(trunk: Network) -> Iterator[tuple[nn.Conv2d, nn.BatchNorm2d]]:
         convs = [m for m in parts if isinstance(m, nn.Conv2d)]
         norms = [m for m in parts if isinstance(m, nn.BatchNorm2d)]
         yield from zip(convs, norms, strict=True)
-
-
-def _set(norm: nn.BatchNorm2d, mean: Tensor, weight: Tensor, bias: Tensor) -> None:
-    norm.running_mean.copy_(mean)  # type: ignore[union-attr]
-    norm.running_var.fill_(1 - norm.eps)  # type: ignore[union-attr]
-    norm.weight.copy_(weight)
-    norm.bias.copy_(bias)

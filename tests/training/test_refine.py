@@ -64,7 +64,18 @@ def test_a_run_goes_on_where_it_stopped_and_exports(banks: list[Bank], photos: t
     begun = Network()
     keep(tmp_path / "state.safetensors", begun, torch.nn.ModuleList())
     for _ in range(2):
-        train(banks[:2], banks[2], photos, tmp_path / "out", tmp_path / "state.safetensors", 2, 0, batch=2, total=4)
+        train(
+            banks[:2],
+            banks[2],
+            photos,
+            tmp_path / "out",
+            tmp_path / "state.safetensors",
+            2,
+            0,
+            batch=2,
+            total=4,
+            hide=0.5,
+        )
     refiner = averaged_refiner(tmp_path / "out" / "refine.safetensors")
     assert not torch.equal(refiner.trunk.stem[0].weight, begun.stem[0].weight)
     fresh = train(banks[:2], banks[2], photos, tmp_path / "new", tmp_path / "state.safetensors", 2, 0, batch=2, total=4)
