@@ -19,7 +19,7 @@ from stages.model.banmo import Banmo, FrameState
 from stages.model.correspondence import soft_argmax
 from stages.model.fields import GridField
 
-_GIVEN_TURN, _GIVEN_SHIFT = 0.4, 0.03
+_GIVEN_TURN, _GIVEN_SHIFT = 0.4, 0.015
 """Radians, units: how far given root poses that may move are off. Pictures tell a turn well and a
 distance badly, so places are held, turns hardly."""
 _SPILL_FREE_PX = 3.0  # as far beside the mask the surface may stick out: rays are drawn there, too

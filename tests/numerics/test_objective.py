@@ -196,7 +196,7 @@ def test_given_root_poses_that_may_move_are_held_softly(seen: Scene) -> None:
     assert "given" not in objective.motion_terms(model, frames, settings)
     model.videos = [replace(video, root_given=True) for video in model.videos]
     found = objective.motion_terms(model, frames, settings)["given"]
-    assert float(found.detach()) == pytest.approx(2.0 * ((1 + 0.5**2) ** 0.5 - 1 + 1.0), rel=1e-3)
+    assert float(found.detach()) == pytest.approx(2.0 * ((1 + 0.5**2) ** 0.5 - 1 + 2.0**2), rel=1e-3)
     found.backward()
     pull = model.root.head.out.bias.grad
     assert pull is not None and float(pull[0]) > 0 and float(pull[5]) > 0
