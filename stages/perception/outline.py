@@ -11,6 +11,8 @@ _LAB_SCALE = np.array([2.55, 1.0, 1.0], np.float32)
 """Lightness shows an outline better than hue, and survives compression."""
 _NOISE_LAB = 4.0
 """Spread of colours that noise alone makes, scaled Lab."""
+_PRIOR_SHARE, _PRIOR_LEAST = 0.7, 0.02
+"""How much of its log-odds the given probability keeps beside the colours, and what keeps those finite."""
 
 
 def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float = 4.0) -> np.ndarray:
@@ -19,6 +21,7 @@ def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float =
     A pixel's share of object is how far its colour lies along the line from the mean colour outside to the mean colour
     inside, both taken within about `reach_px` (the blend of an edge pixel). It counts by how well the two are told
     apart there, and is added to the log-odds of `probability` (H, W) in 0..1 of the 8-bit RGB `image` (H, W, 3).
+    What is certain, 0 or 1, and not near the outline, stays so: a fit takes these values as the opacity that it wants.
     """
     rim_px = 0.375 * reach_px
     inside = (probability > 0.5).astype(np.uint8)
@@ -32,8 +35,10 @@ def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float =
     share = ((lab - back) * line).sum(-1) / np.maximum(length, 1.0)
     apart = np.clip(np.sqrt(length) / (front_spread + back_spread + _NOISE_LAB) - 0.7, 0.0, 2.0)
     looks = np.clip(4.0 * (share - 0.5), -3.0, 3.0) * apart * (front_known & back_known)
-    prior = np.log((probability + 0.02) / (1.02 - probability))
-    return (1.0 / (1.0 + np.exp(-(0.7 * prior + 2.0 * looks)))).astype(np.float32)
+    prior = np.log((probability + _PRIOR_LEAST) / (1 + _PRIOR_LEAST - probability))
+    found = 1.0 / (1.0 + np.exp(-(_PRIOR_SHARE * prior + 2.0 * looks)))
+    certain = 1.0 / (1.0 + ((1 + _PRIOR_LEAST) / _PRIOR_LEAST) ** _PRIOR_SHARE)  # what a probability of 0 has become
+    return np.clip((found - certain) / (1 - 2 * certain), 0.0, 1.0).astype(np.float32)
 
 
 def _local_colours(lab: np.ndarray, chosen: np.ndarray, sigma_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -40,3 +40,13 @@ def test_what_looks_alike_stays_as_it_was() -> None:
 def test_nothing_stays_nothing() -> None:
     image, _ = _scene((180, 120, 60), (90, 100, 110))
     assert settle_outline(np.zeros((96, 96), np.float32), image).max() < 0.1
+
+
+def test_what_is_certain_stays_certain() -> None:
+    """A fit takes a mask's values as the opacity it wants: background that stays at 6 % would be fog."""
+    image, truth = _scene((180, 120, 60), (90, 100, 110))
+    found = settle_outline(truth.astype(np.float32), image)
+    far_in = cv2.erode(truth.astype(np.uint8), np.ones((15, 15))) > 0
+    far_off = cv2.dilate(truth.astype(np.uint8), np.ones((41, 41))) == 0
+    assert found[far_in].min() > 0.999
+    assert found[far_off].max() < 0.001
