@@ -17,7 +17,16 @@ from training.corruption import corrupted
 from training.dressing import _hidden, dress
 from training.export import refiner_model
 from training.network import CATEGORIES, Network
-from training.refine import Refiner, averaged_refiner, examples, overlap, refiner_input, refining_loss, train
+from training.refine import (
+    Refiner,
+    averaged_refiner,
+    examples,
+    lost_weight,
+    overlap,
+    refiner_input,
+    refining_loss,
+    train,
+)
 from training.revive import calibrate, revive
 from training.train import keep, load_bank
 from training.wardrobe import Bank, Random
@@ -57,6 +66,18 @@ def test_the_loss_asks_for_the_outline() -> None:
     inside[:, 0, 8:24] = 8.0  # as many far off
     assert refining_loss(right, mask) < 0.02
     assert refining_loss(beside, mask) > 2 * refining_loss(inside, mask)
+
+
+def test_pieces_that_the_rough_mask_lacks_can_weigh_more() -> None:
+    mask, rough = torch.zeros(2, 1, 32, 32)
+    mask[:, 8:28, 8:24] = 1
+    rough[:, 8:18, 8:24] = 1  # ends three pixels and more before ...
+    heavy = lost_weight(mask, rough, 8.0)
+    assert (heavy[:, 21:28, 8:24] == 8).all()  # ... this piece
+    assert heavy.sum() == 7 * 16 * 8 + (32 * 32 - 7 * 16)
+    without = 8 * (2 * rough - 1)
+    assert refining_loss(without, mask, heavy) > 1.5 * refining_loss(without, mask)
+    assert refining_loss(without, mask, lost_weight(mask, rough, 1.0)) == refining_loss(without, mask)
 
 
 def test_a_run_goes_on_where_it_stopped_and_exports(banks: list[Bank], photos: torch.Tensor, tmp_path: Path) -> None:
