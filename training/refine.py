@@ -239,7 +239,7 @@ def main(
         seed: Of everything random.
         batch: Pictures a step and category.
         hide: Share of pictures in which an end of the object looks like its background.
-        lost: How heavy pieces are that the rough mask lacks.
+        lost: How heavy pieces are that the rough mask lacks; with 1, and `hide` 0, the shipped refiner was made.
         photos: How many backgrounds to make.
         threads: CPU threads.
     """

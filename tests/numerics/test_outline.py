@@ -39,7 +39,7 @@ def test_what_looks_alike_stays_as_it_was() -> None:
 
 def test_nothing_stays_nothing() -> None:
     image, _ = _scene((180, 120, 60), (90, 100, 110))
-    assert settle_outline(np.zeros((96, 96), np.float32), image).max() < 0.1
+    assert settle_outline(np.zeros((96, 96), np.float32), image).max() < 1e-6
 
 
 def test_what_is_certain_stays_certain() -> None:
