@@ -194,8 +194,10 @@ def _cost(seen: Seen, settings: Phases, few: int = 20, more: int = 80) -> tuple[
     return max(0.0, short - phases * few * each), each
 
 
-def accuracy(workspace: Path, data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int) -> None:
-    """Print what ours and the plain version reach after equal processor time."""
+def accuracy(
+    workspace: Path, data: Path, evaluate: Path, minutes: tuple[float, ...], seed: int, versions: tuple[str, ...]
+) -> None:
+    """Print what each of `versions` ("ours", "plain") reaches after equal processor time."""
     from benchmarks.trials import judge, observe, presets, reconstruct, write_meshes
 
     seen = observe(workspace)
@@ -209,6 +211,8 @@ def accuracy(workspace: Path, data: Path, evaluate: Path, minutes: tuple[float, 
     log.info("| --- | --- | --- | --- | --- | --- | --- |")
     for wanted in minutes:
         for name, first, last in (("ours", fit, refine), ("plain", plain, replace(refine, iterations=0))):
+            if name not in versions:
+                continue
             # How many steps the time buys is measured; the shares of the phases stay those of the preset.
             start, each = _cost(seen, (first, skipped, last))
             total = (wanted * 60 - start) / each
@@ -236,6 +240,7 @@ def main() -> None:
     parser.add_argument("--workspace", type=Path, help="where the stages up to poses made something of it")
     parser.add_argument("--evaluate", type=Path, help="the evaluation script")
     parser.add_argument("--minutes", type=float, nargs="*", default=(2.0, 5.0, 10.0))
+    parser.add_argument("--versions", nargs="*", default=("ours", "plain"), choices=("ours", "plain"))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
@@ -243,7 +248,7 @@ def main() -> None:
     if args.data is not None:
         if args.evaluate is None or args.workspace is None:
             parser.error("--data needs --workspace and --evaluate")
-        accuracy(args.workspace, args.data, args.evaluate, tuple(args.minutes), args.seed)
+        accuracy(args.workspace, args.data, args.evaluate, tuple(args.minutes), args.seed, tuple(args.versions))
         return
     speed(args.device, args.steps)
     if args.frames:
