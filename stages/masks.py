@@ -32,7 +32,7 @@ from stages.formats import (
     write_mask_facts,
 )
 from stages.networks import NO_FILE, PromptedMaskNetwork, mask_network
-from stages.own_networks import CATEGORIES, OwnNetwork, OwnRefiner
+from stages.own_networks import CATEGORIES, OwnNetwork, OwnRefiner, OwnTrunk
 from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.prior import object_prior
@@ -83,9 +83,12 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
         images = clip.images()
         priors = _priors(images, settings.category, run)
         refiner = OwnRefiner(device=run.device, threads=run.threads)
-        result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner)
+        trunk = OwnTrunk(device=run.device, threads=run.threads)
+        result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner, trunk=trunk)
         run.metric("category_prior", result.prior or "none")
         run.metric("refined_by", refiner.name if result.refined else "none")
+        run.metric("frames_found_again", result.found_again)
+        run.metric("found_again_by", trunk.name if result.found_again else "none")
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
     facts = _facts(provider, result, clip, settings.threshold)

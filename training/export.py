@@ -5,7 +5,8 @@
 For every category: ``cse-<category>.onnx`` (picture 1x3xHxW, normalised by ImageNet's mean and deviation, H and W
 multiples of 16 -> 17 channels at half the size: mask logit, then a 16-D embedding of unit length),
 ``posenet-<category>.onnx`` (4x96x96: picture and mask -> `view` 60 logits, `dense` 17x48x48, `category` 3 logits) and
-``<category>.npz`` (vertices, faces, embedding of the canonical surface). Batch normalisation is folded into the
+``<category>.npz`` (vertices, faces, embedding of the canonical surface); and ``trunk.onnx``, what the categories share
+(picture 1x3xHxW -> 64 features at an eighth of the size). Batch normalisation is folded into the
 convolutions; weights are kept in half precision and widened when the file is opened.
 """
 
@@ -29,6 +30,7 @@ from synthetic.canonical import canonical_body
 from training.losses import Surface
 from training.network import CATEGORIES, EMBEDDING, INPUT_PX, VIEW_OUTPUTS, Network
 from training.refine import Refiner, averaged_refiner
+from training.revive import revive_trunk
 from training.train import make_surface, read_state
 
 log = logging.getLogger(__name__)
@@ -114,14 +116,24 @@ class _Graph:
 
 def _trunk(g: _Graph, network: Network, x: str) -> dict[str, str]:
     """As `Network.forward`. `x` holds 16 channels at half the size."""
+    at2, at4, at8, at16 = _down(g, network, x)
+    fine8 = _up8(g, network, at8, at16)
+    fine4 = g.layer(g.op("Add", g.layer(fine8, network.up4), g.layer(at4, network.side4)), network.join4)
+    fine2 = g.layer(g.op("Add", g.layer(fine4, network.up2), g.layer(at2, network.side2)), network.join2)
+    return {"at16": at16, "fine8": fine8, "fine4": fine4, "fine2": fine2}
+
+
+def _down(g: _Graph, network: Network, x: str) -> tuple[str, str, str, str]:
+    """Features at a half, a quarter, an eighth and a sixteenth of the size, on the way down."""
     at2 = g.layer(x, network.stem)
     at4 = g.layer(g.layer(at2, network.down4), network.at4)
     at8 = g.layer(g.layer(at4, network.down8), network.at8)
-    at16 = g.layer(g.layer(at8, network.down16), network.at16)
-    fine8 = g.layer(g.op("Add", g.layer(at16, network.up8), g.layer(at8, network.side8)), network.join8)
-    fine4 = g.layer(g.op("Add", g.layer(fine8, network.up4), g.layer(at4, network.side4)), network.join4)
-    fine2 = g.layer(g.op("Add", g.layer(fine4, network.up2), g.layer(at2, network.side2)), network.join2)
-    return {"at16": at16, "fine4": fine4, "fine2": fine2}
+    return at2, at4, at8, g.layer(g.layer(at8, network.down16), network.at16)
+
+
+def _up8(g: _Graph, network: Network, at8: str, at16: str) -> str:
+    """Features at an eighth of the size, on the way up."""
+    return g.layer(g.op("Add", g.layer(at16, network.up8), g.layer(at8, network.side8)), network.join8)
 
 
 def _halve(g: _Graph, x: str) -> str:
@@ -160,6 +172,16 @@ def cse_model(network: Network, category: int, provenance: dict[str, str]) -> on
     parts = _trunk(g, network, _halve(g, g.op("Concat", "image", none, axis=1)))
     outputs = {"dense": (_dense(g, network, parts, category), ["n", 1 + EMBEDDING, "h2", "w2"])}
     return _finish(g, [image], outputs, f"cse-{CATEGORIES[category]}", provenance)
+
+
+def trunk_model(network: Network, provenance: dict[str, str]) -> onnx.ModelProto:
+    """Picture N x 3 x H x W -> `features` N x 64 x H/8 x W/8 of the trunk on its way up; nothing beyond them."""
+    g = _Graph()
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, "h", "w"])
+    none = g.op("Mul", g.op("ReduceMean", "image", axes=[1], keepdims=1), g.constant(np.array(0, np.float32)))
+    at8, at16 = _down(g, network, _halve(g, g.op("Concat", "image", none, axis=1)))[2:]
+    outputs = {"features": (_up8(g, network, at8, at16), ["n", network.join8[0].out_channels, "h8", "w8"])}
+    return _finish(g, [image], outputs, "trunk", provenance)
 
 
 def posenet_model(network: Network, category: int, provenance: dict[str, str]) -> onnx.ModelProto:
@@ -205,9 +227,7 @@ def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]
             ("cse", cse_model(network, k, provenance)),
             ("posenet", posenet_model(network, k, provenance)),
         ):
-            digests[f"{kind}-{name}.onnx"] = _write(
-                out / f"{kind}-{name}.onnx", model.SerializeToString(deterministic=True)
-            )
+            digests[f"{kind}-{name}.onnx"] = _write_model(out / f"{kind}-{name}.onnx", model)
         body, surface = canonical_body(name), surfaces[k]
         assert isinstance(surface, Surface)
         part = out / f".{name}.npz"
@@ -220,7 +240,21 @@ def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]
             )
         part.replace(out / f"{name}.npz")
         digests[f"{name}.npz"] = hashlib.sha256((out / f"{name}.npz").read_bytes()).hexdigest()
+    digests["trunk.onnx"] = _write_model(out / "trunk.onnx", trunk_model(network, provenance))
     return digests
+
+
+def trunk_of(path: Path, out: Path) -> dict[str, str]:
+    """Write ``trunk.onnx`` of an exported category's network; returns its sha256 by name."""
+    network = Network().eval()
+    revive_trunk(network, path)
+    provenance = {p.key: p.value for p in onnx.load(path).metadata_props}
+    out.mkdir(parents=True, exist_ok=True)
+    return {"trunk.onnx": _write_model(out / "trunk.onnx", trunk_model(network, provenance))}
+
+
+def _write_model(path: Path, model: onnx.ModelProto) -> str:
+    return _write(path, model.SerializeToString(deterministic=True))
 
 
 def _write(path: Path, data: bytes) -> str:
@@ -235,10 +269,13 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
 
     Args:
         state: The `state.safetensors` of a training run (`log.jsonl` beside it), or the `refine.safetensors` of a
-            refiner's (`refine.jsonl` beside it).
+            refiner's (`refine.jsonl` beside it), or an exported `posenet-<category>.onnx`, for its `trunk.onnx`.
         out: Folder to write to.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if state.suffix == ".onnx":
+        _log(trunk_of(state, out))
+        return
     refining = state.stem == "refine"
     lines = (state.parent / ("refine.jsonl" if refining else "log.jsonl")).read_text(encoding="utf-8").splitlines()
     last = json.loads(lines[-1])
@@ -252,9 +289,13 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
     if refining:
         out.mkdir(parents=True, exist_ok=True)
         model = refiner_model(averaged_refiner(state), provenance)
-        written = {"refine.onnx": _write(out / "refine.onnx", model.SerializeToString(deterministic=True))}
+        written = {"refine.onnx": _write_model(out / "refine.onnx", model)}
     else:
         written = export(state, out, provenance)
+    _log(written)
+
+
+def _log(written: dict[str, str]) -> None:
     for name, digest in written.items():
         log.info("%s  %s", digest, name)
 

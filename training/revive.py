@@ -5,7 +5,7 @@ Weights come back in the half precision they were kept in.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,33 @@ def revive(trunk: Network, head: nn.Conv2d, path: Path) -> None:
     Raises:
         ValueError: the file does not hold such a network.
     """
-    weights = [numpy_helper.to_array(w) for w in onnx.load(path).graph.initializer if w.name.startswith("w_")]
-    layers = [*_layers(trunk), (head, None)]
+    weights, layers = _weights(path), [*_layers(trunk), (head, None)]
     if len(weights) != 2 * len(layers):
         raise ValueError(f"{path} holds {len(weights)} weights, a refiner {2 * len(layers)}")
+    _give(layers, weights)
+
+
+def revive_trunk(trunk: Network, path: Path) -> None:
+    """Give a trunk the weights of an exported network that begins with one; heads stay as they are.
+
+    Raises:
+        ValueError: the file does not begin with such a trunk.
+    """
+    weights, layers = _weights(path), list(_layers(trunk))
+    shapes = [tuple(conv.weight.shape) for conv, _ in layers]
+    if [w.shape for w in weights[: 2 * len(layers) : 2]] != shapes:
+        raise ValueError(f"{path} does not begin with the categories' trunk")
+    _give(layers, weights)
+
+
+def _weights(path: Path) -> list[np.ndarray]:
+    return [numpy_helper.to_array(w) for w in onnx.load(path).graph.initializer if w.name.startswith("w_")]
+
+
+def _give(layers: Sequence[tuple[nn.Conv2d, nn.BatchNorm2d | None]], weights: list[np.ndarray]) -> None:
+    """Kernel and bias of each layer, in order; a normalisation carries the bias and does nothing else."""
     with torch.no_grad():
-        for (conv, norm), kernel, bias in zip(layers, weights[::2], weights[1::2], strict=True):
+        for (conv, norm), kernel, bias in zip(layers, weights[::2], weights[1::2], strict=False):
             conv.weight.copy_(torch.from_numpy(kernel.astype(np.float32)))
             shift = torch.from_numpy(bias.astype(np.float32))
             if norm is None:

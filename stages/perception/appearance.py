@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from torch import nn
@@ -101,3 +102,11 @@ def _seed_weights(module: nn.Module, generator: torch.Generator) -> None:
 def scaled_lab(image: np.ndarray) -> np.ndarray:
     """(H, W, 3) float32 Lab of an 8-bit RGB image in units of about 1."""
     return to_lab(image) / LAB_UNIT - np.array([1.0, 0.0, 0.0], np.float32)
+
+
+def coloured_surroundings(image: np.ndarray) -> np.ndarray:
+    """(h, w, 12) float32: Lab as it is, blurred twice, and its local spread."""
+    lab = scaled_lab(image)
+    spread = cv2.GaussianBlur(lab**2, (0, 0), 1.2) - cv2.GaussianBlur(lab, (0, 0), 1.2) ** 2
+    blurred = [cv2.GaussianBlur(lab, (0, 0), s) for s in (0.8, 1.6)]
+    return np.concatenate([lab, *blurred, 3 * np.sqrt(np.maximum(spread, 0))], axis=-1)

@@ -3,10 +3,11 @@
 1. Motion against the background gives each frame sharp but sparse evidence (`background.motion_cues`).
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
-3. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
+3. Where that lost an object of a known category, features of the categories' network find it again (`lost_frames`).
+4. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
    size. Anything else: the same again on plain colours, leaving the uncertain rim of the mask out of the fit; this
    tightens the outline.
-4. Flicker is voted away along the flow, and the outline is settled at full resolution.
+5. Flicker is voted away along the flow, and the outline is settled at full resolution.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from stages.perception.appearance import PixelColours, scaled_lab
+from stages.perception.appearance import PixelColours, coloured_surroundings, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
+from stages.perception.lost_frames import TrunkNetwork, find_again
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
 from stages.perception.refining import RefiningNetwork, refine
-from stages.perception.temporal import flow_median, main_component
+from stages.perception.temporal import flow_median, main_component, resize_maps
 
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
@@ -53,6 +55,7 @@ class Segmentation:
     agreement: np.ndarray
     prior: str = ""  # the category whose network had a say
     refined: bool = False  # whether a network went over the rough mask
+    found_again: int = 0  # frames in which colours and motion had lost the object
 
 
 @dataclass(frozen=True)
@@ -100,11 +103,12 @@ def segment(
     tick: Tick = lambda done, total, label: None,
     priors: dict[str, np.ndarray] | None = None,
     refiner: RefiningNetwork | None = None,
+    trunk: TrunkNetwork | None = None,
 ) -> Segmentation:
     """Foreground probability of every frame of a clip, (T, H, W, 3) uint8 RGB.
 
     `priors` are category networks' ideas of it, (T, H, W) uint8 each; the one that fits what moves has a say.
-    `refiner` makes the rough mask of such an object exact.
+    `trunk` finds such an object again in frames that lost it, `refiner` makes the rough mask of it exact.
     """
     effort = effort or Effort()
     work = [shrink(image, WORK_SIDE_PX) for image in images]
@@ -120,6 +124,10 @@ def segment(
         known = told
     soft = coarse_probability(work, cues, known, carrier, effort)
     tick(1, 2, "learning")
+    again = 0
+    if trunk is not None and chosen:
+        soft, lost = find_again(work, soft, told, trunk, effort.seed)
+        again = int(lost.sum())
     refined = refiner is not None and bool(chosen) and effort.refinements > 0
     if refiner is not None and refined:
         # Not of a tightened mask: where colours were wrong, that one has lost what the network would have seen.
@@ -128,7 +136,7 @@ def segment(
         soft = tight_probability(work, soft, cues, known, effort)
     tick(2, 2, "learning")
     found = finish(images, soft, carrier)
-    return Segmentation(found.probability, found.agreement, chosen, refined)
+    return Segmentation(found.probability, found.agreement, chosen, refined, again)
 
 
 # --------------------------------------------------------------------------------------------- the steps
@@ -143,7 +151,7 @@ def coarse_probability(
     """
     height, width = work[0].shape[:2]
     half = [cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA) for image in work]
-    evidence, moving, told = (_resized(maps, width // 2, height // 2) for maps in (cues.evidence, cues.moving, told))
+    evidence, moving, told = (resize_maps(maps, width // 2, height // 2) for maps in (cues.evidence, cues.moving, told))
     centre = np.exp(-0.5 * (border_distance(height // 2, width // 2) / 0.75) ** 6)
     seed = np.clip(evidence / 1.5, 0, 1) * centre * np.clip(moving / 0.3, 0, 1)
     seed = np.where(told > 0.5, np.maximum(seed, np.clip(told / 3, 0, 1)), np.where(told < -0.5, 0, seed))
@@ -152,7 +160,7 @@ def coarse_probability(
     away = np.where(told < -0.5, 1.0, away)
     label = (seed > away).astype(np.float32)
     weight = np.where(seed > 0.2, seed, np.where(away > 0.2, 0.7 * away, 0)).astype(np.float32)
-    values = np.stack([_coloured_surroundings(image) for image in half])
+    values = np.stack([coloured_surroundings(image) for image in half])
     soft = seed.astype(np.float32)
     for turn in range(effort.rounds):
         colours = PixelColours(values.shape[-1], effort.seed + turn)
@@ -165,7 +173,7 @@ def coarse_probability(
         label = (soft > 0.5).astype(np.float32)
         sure = np.abs(soft - 0.5) * 2
         weight = np.where(sure > 0.4, sure, 0).astype(np.float32)
-    return _resized(np.stack([main_component(s > 0.5, s) * s for s in soft]), width, height)
+    return resize_maps(np.stack([main_component(s > 0.5, s) * s for s in soft]), width, height)
 
 
 def tight_probability(
@@ -206,7 +214,7 @@ def refined_probability(
 ) -> np.ndarray:
     """(T, H, W) probability at the images' own size: the coarse one mended, several times over; hints still count."""
     height, width = images.shape[1:3]
-    found = _resized(soft, width, height)
+    found = resize_maps(soft, width, height)
     hinted = told.any()
     for _ in range(effort.refinements):
         found = refine(images, found, refiner)
@@ -240,7 +248,7 @@ def _motion(work: list[np.ndarray], tick: Tick) -> MotionCues:
     """Motion cues at the working size, found at a smaller one."""
     height, width = work[0].shape[:2]
     found = motion_cues([shrink(image, MOTION_SIDE_PX) for image in work], tick=lambda n: tick(n, len(work), "motion"))
-    return MotionCues(_resized(found.moving, width, height), _resized(found.evidence, width, height))
+    return MotionCues(resize_maps(found.moving, width, height), resize_maps(found.evidence, width, height))
 
 
 def hint_evidence(hints: tuple[Hint, ...], full: tuple[int, ...], work: tuple[int, ...], count: int) -> np.ndarray:
@@ -267,7 +275,7 @@ def choose_prior(priors: dict[str, np.ndarray], cues: MotionCues) -> str:
     """Name of the prior (T, H, W) uint8 that is surest of itself and covers what moves; "" if none does."""
     best, best_score = "", 0.0
     for name, prior in sorted(priors.items()):
-        maps = _resized(prior, cues.evidence.shape[2], cues.evidence.shape[1]) / 255
+        maps = resize_maps(prior, cues.evidence.shape[2], cues.evidence.shape[1]) / 255
         inside = maps > 0.5
         present = float((inside.reshape(len(maps), -1).mean(axis=1) > LEAST_PRIOR_AREA).mean())
         sure = float(maps[inside].sum() / max(np.count_nonzero(maps > 0.2), 1))
@@ -282,14 +290,8 @@ def choose_prior(priors: dict[str, np.ndarray], cues: MotionCues) -> str:
 
 def prior_evidence(prior: np.ndarray, work: tuple[int, ...]) -> np.ndarray:
     """(T, h, w) log-odds, within +-3, of a prior (T, H, W) uint8."""
-    share = _resized(prior, work[1], work[0]) / 255
+    share = resize_maps(prior, work[1], work[0]) / 255
     return np.clip(np.log((share + 0.03) / (1.03 - share)), -3.0, 3.0).astype(np.float32)
-
-
-def _resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(T, height, width) float32 of maps of another size."""
-    kind = cv2.INTER_AREA if width < maps.shape[2] else cv2.INTER_LINEAR
-    return np.stack([cv2.resize(m.astype(np.float32), (width, height), interpolation=kind) for m in maps])
 
 
 def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -297,14 +299,6 @@ def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
     blurred = np.stack([cv2.GaussianBlur(m.astype(np.float32), (0, 0), sigma_px) for m in maps])
     top = np.quantile(blurred.reshape(len(maps), -1), 0.99, axis=1)
     return blurred / np.maximum(top, 0.1)[:, None, None]
-
-
-def _coloured_surroundings(image: np.ndarray) -> np.ndarray:
-    """(h, w, 12) float32: Lab as it is, blurred twice, and its local spread."""
-    lab = scaled_lab(image)
-    spread = cv2.GaussianBlur(lab**2, (0, 0), 1.2) - cv2.GaussianBlur(lab, (0, 0), 1.2) ** 2
-    blurred = [cv2.GaussianBlur(lab, (0, 0), s) for s in (0.8, 1.6)]
-    return np.concatenate([lab, *blurred, 3 * np.sqrt(np.maximum(spread, 0))], axis=-1)
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:

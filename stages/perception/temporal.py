@@ -124,3 +124,9 @@ def enlarge(flow: np.ndarray, width: int, height: int) -> np.ndarray:
     """A flow (h, w, 2) at another size, its lengths scaled along."""
     scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     return cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR) * scale
+
+
+def resize_maps(maps: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(T, height, width) float32 of maps of another size."""
+    kind = cv2.INTER_AREA if width < maps.shape[2] else cv2.INTER_LINEAR
+    return np.stack([cv2.resize(m.astype(np.float32), (width, height), interpolation=kind) for m in maps])

@@ -15,7 +15,7 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import main as write_bank
 from training.corruption import corrupted
 from training.dressing import _hidden, dress
-from training.export import refiner_model
+from training.export import posenet_model, refiner_model, trunk_of
 from training.network import CATEGORIES, Network
 from training.refine import (
     Refiner,
@@ -173,3 +173,26 @@ def test_an_exported_refiner_can_be_trained_on(banks: list[Bank], photos: torch.
     with pytest.raises(ValueError, match="holds 0 weights"):
         path.write_bytes(onnx.ModelProto().SerializeToString())
         revive(again.trunk, again.head, path)
+
+
+def test_the_trunk_cut_from_an_exported_network_sees_what_the_network_saw(tmp_path: Path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(4)
+        network = Network().eval()
+    whole = tmp_path / "posenet-human.onnx"
+    whole.write_bytes(posenet_model(network, 1, {"made_by": "a test"}).SerializeToString())
+    (name,) = trunk_of(whole, tmp_path)
+    seen: list[torch.Tensor] = []
+    handle = network.join8.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
+    image = torch.rand(2, 3, 48, 80)
+    with torch.no_grad():
+        network.features(torch.cat([image, torch.zeros(2, 1, 48, 80)], 1))
+    handle.remove()
+    cut = onnxruntime.InferenceSession(tmp_path / name)
+    (features,) = cut.run(["features"], {"image": image.numpy()})
+    assert features.shape == (2, 64, 6, 10)
+    np.testing.assert_allclose(features, seen[0].numpy(), atol=0.01 * float(seen[0].abs().max()))
+    assert onnx.load(tmp_path / name).metadata_props[0].value == "a test"
+    with pytest.raises(ValueError, match="does not begin with"):
+        whole.write_bytes(onnx.ModelProto().SerializeToString())
+        trunk_of(whole, tmp_path)

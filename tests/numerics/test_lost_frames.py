@@ -1,0 +1,107 @@
+"""Frames that lost the object: found again by features that tell it, left alone where none do or none is lost."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.own_networks import OwnTrunk
+from stages.perception.lost_frames import find_again, steadiness, trunk_features
+from stages.perception.temporal import intersection_over_union
+
+COUNT, HEIGHT, WIDTH = 24, 64, 96
+LOST = range(9, 13)
+
+
+class _Knowing:
+    """Features that show the object (plus noise), whatever the picture looks like; with `blind` they show nothing."""
+
+    def __init__(self, truth: np.ndarray, blind: bool = False) -> None:
+        self.truth, self.blind, self.at = truth, blind, 0
+        self.rng = np.random.default_rng(5)
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        out = self.rng.normal(0, 0.2, (len(inputs), 4, HEIGHT // 8, WIDTH // 8)).astype(np.float32)
+        for k in range(len(inputs)):
+            small = cv2.resize(self.truth[self.at], (WIDTH // 8, HEIGHT // 8), interpolation=cv2.INTER_AREA)
+            out[k, 1] += 0.0 if self.blind else 2 * small
+            self.at += 1
+        return out
+
+
+def _clip() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Frames, true and rough masks: a block on grey, as grey itself in every other frame; four rough masks lost it."""
+    rng = np.random.default_rng(0)
+    truth = np.zeros((COUNT, HEIGHT, WIDTH), np.float32)
+    frames = []
+    for t in range(COUNT):
+        truth[t, 16:48, 10 + 2 * t : 42 + 2 * t] = 1
+        bright = 90 if t in LOST or t % 2 else 180
+        frame = 90 + (bright - 90) * truth[t][..., None] + rng.normal(0, 6, (HEIGHT, WIDTH, 3))
+        frames.append(np.clip(frame, 0, 255).astype(np.uint8))
+    rough = 0.05 + 0.9 * truth
+    for t in LOST:
+        rough[t, :, 18 + 2 * t :] = 0.05
+    return frames, truth, rough.astype(np.float32)
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return intersection_over_union(a > 0.5, b > 0.5)
+
+
+def test_what_features_tell_is_found_again_and_the_rest_stays() -> None:
+    frames, truth, rough = _clip()
+    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    assert np.flatnonzero(lost).tolist() == list(LOST)
+    assert max(_overlap(rough[t], truth[t]) for t in LOST) < 0.4
+    assert min(_overlap(mended[t], truth[t]) for t in LOST) > 0.8
+    np.testing.assert_array_equal(mended[~lost], rough[~lost])
+
+
+def test_features_that_tell_nothing_find_nothing() -> None:
+    frames, truth, rough = _clip()
+    mended, _ = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth, blind=True), seed=0)
+    assert max(_overlap(mended[t], truth[t]) for t in LOST) < 0.5
+    grey = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * COUNT  # nor do colours here: the classifier learns nothing
+    untouched, lost = find_again(grey, rough, np.zeros_like(rough), _Knowing(truth, blind=True), seed=0)
+    assert not lost.any()
+    np.testing.assert_array_equal(untouched, rough)
+
+
+def test_a_clip_that_lost_nothing_comes_back_as_it_was() -> None:
+    frames, truth, _ = _clip()
+    rough = (0.05 + 0.9 * truth).astype(np.float32)
+    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    assert not lost.any()
+    np.testing.assert_array_equal(mended, rough)
+
+
+def test_a_hint_counts_where_features_say_otherwise() -> None:
+    frames, truth, rough = _clip()
+    told = np.zeros_like(rough)
+    told[LOST, :, :30] = -20.0
+    mended, _ = find_again(frames, rough, told, _Knowing(truth), seed=0)
+    beyond = mended - rough
+    assert not (beyond[LOST, :, :26] > 0.01).any() and (beyond[LOST, :, 34:] > 0.5).any()
+
+
+def test_a_clip_without_any_mask_stays_without() -> None:
+    frames, truth, _ = _clip()
+    nothing = np.zeros_like(truth)
+    mended, lost = find_again(frames, nothing, nothing, _Knowing(truth), seed=0)
+    assert not lost.any() and not mended.any()
+
+
+def test_steadiness_sees_a_mask_that_shrank() -> None:
+    _, _, rough = _clip()
+    trust = steadiness(rough)
+    assert trust[list(LOST)].max() == 0 and np.delete(trust, list(LOST)).min() == 1
+
+
+def test_the_shipped_trunk_gives_features_of_any_size() -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 255, (50, 90, 3)).astype(np.uint8) for _ in range(3)]
+    features = trunk_features(frames, OwnTrunk())
+    assert features.shape == (3, 6, 12, 64) and features.dtype == np.float32
+    assert np.isfinite(features).all() and features.std() > 0.01
+    np.testing.assert_allclose(trunk_features(frames[1:2], OwnTrunk())[0], features[1], atol=1e-4)
