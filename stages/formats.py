@@ -276,6 +276,7 @@ class PoseTrack:
     object_to_camera: np.ndarray  # (T, 4, 4) float64, rigid
     confidence: np.ndarray  # (T,) float in 0..1
     provider: list[str]  # who spoke, a frame
+    jitter_rad: float = 0.0  # root mean square turn that was taken out of given poses from frame to frame
 
 
 def write_poses(path: Path, track: PoseTrack, clip: Clip) -> None:
@@ -289,6 +290,7 @@ def write_poses(path: Path, track: PoseTrack, clip: Clip) -> None:
             "time_s": [float(t) for t in clip.time_s],
             "confidence": [round(float(c), 4) for c in track.confidence],
             "provider": track.provider,
+            "jitter_rad": float(track.jitter_rad),
         },
     )
 
@@ -303,6 +305,7 @@ def read_poses(path: Path) -> PoseTrack:
             object_to_camera=poses.reshape(-1, 4, 4),
             confidence=np.array(info.get("confidence", [1.0] * len(poses)), np.float64),
             provider=list(info.get("provider", ["given"] * len(poses))),
+            jitter_rad=float(info.get("jitter_rad", 0.0)),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path.name}: {error!r} missing or malformed") from error

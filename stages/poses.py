@@ -30,7 +30,7 @@ from stages.registration.placing import (
 from stages.registration.search import search
 from stages.registration.seen import seen
 from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
-from stages.registration.steadying import steady
+from stages.registration.steadying import jitter, steady
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
@@ -147,7 +147,7 @@ def _steadied(
     run.metric("steadied_turns_s", around_s)
     run.metric("steadied_places_s", placed_s)
     return {
-        name: replace(track, object_to_camera=made)
+        name: replace(track, object_to_camera=made, jitter_rad=jitter(track.object_to_camera, made))
         for (name, track), made in zip(tracks.items(), matrices, strict=True)
     }
 

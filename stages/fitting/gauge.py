@@ -3,6 +3,10 @@
 Pictures only see ``G(t) J_b(t)``; a rigid motion can move from the root pose G to all bones J at once and nothing
 rendered changes. What the fit leaves there is whatever the first root poses had wrong, so it is settled afterwards:
 object space is the frame in which the bulk of the surface (a trunk, not limbs) is nearly at rest.
+
+Where root poses were given and jittered, their object space is meant, but what smoothing leaves of the jitter is a slow
+wave in them, which the bones make up for: the trunk appears to sway. Of what it sways slowly, as much goes to the root
+as such a wave may explain (a Wiener filter with one weight a clip).
 """
 
 from __future__ import annotations
@@ -10,10 +14,17 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from stages.geometry.rotations import invert_rigid, matrix_to_quaternion, quaternion_to_matrix, rigid
 from stages.model.banmo import Banmo
+
+SLOW_S = 0.75
+"""What a trunk does slower than this (seconds, a Gaussian's width) may be the given root poses' doing."""
+
+SWAY_SOFTNESS = 0.12
+"""As `softness` below, where a trunk that does sway must not be told from one that seems to: more of the body votes."""
 
 
 @torch.no_grad()
@@ -26,7 +37,7 @@ def settle(
 ) -> float:
     """Set ``model.gauge`` so that the surface moves least in object space; root poses that are held stay as they are.
 
-    So do those that somebody gave and that may move (``root_given``): their object space is meant.
+    Of those that somebody gave and that may move (``root_given``) object space is meant: they lose a slow wave at most.
 
     `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
     `steady_s` (seconds, a Gaussian's width) stays with the bones: a hand-held camera and a body's heading are slower.
@@ -42,20 +53,46 @@ def settle(
         placed.append(model.forward_points(state, points[None].expand(len(some), -1, -1)).cpu())
         poses.append(state.camera_from_object.cpu())
     posed, whole = torch.cat(placed), torch.cat(poses)
-    may = (model.root_free > 0) & ~model.root_given
-    free = may[model.video_idx].cpu()
+    may = model.root_free > 0
+    free = (may & ~model.root_given)[model.video_idx].cpu()
+    motion = torch.eye(4).repeat(len(whole), 1, 1)
+    if free.any():
+        motion = rigid_parts(posed, free, softness, rounds)
+        settled = whole @ invert_rigid(motion)
+        for i, video in enumerate(model.videos):
+            mine = slice(model.starts[i], model.starts[i + 1])
+            if free[mine].all():
+                settled[mine] = steadied(settled[mine], np.asarray(video.time_s), steady_s)
+        motion = torch.where(free[:, None, None], invert_rigid(settled) @ whole, motion)
+    for i, video in enumerate(model.videos):
+        if video.root_given and video.root_jitter_rad > 0 and may[i]:
+            mine = slice(model.starts[i], model.starts[i + 1])
+            free[mine] = True
+            rest = rigid_parts(posed[mine], torch.ones(mine.stop - mine.start, dtype=torch.bool), SWAY_SOFTNESS, rounds)
+            motion[mine] = unswayed(rest, np.asarray(video.time_s), video.root_jitter_rad)
     if not free.any():
         return 0.0
-    motion = rigid_parts(posed, free, softness, rounds)
-    settled = whole @ invert_rigid(motion)
-    for i, video in enumerate(model.videos):
-        mine = slice(model.starts[i], model.starts[i + 1])
-        if free[mine].all():
-            settled[mine] = steadied(settled[mine], np.asarray(video.time_s), steady_s)
-    motion = torch.where(free[:, None, None], invert_rigid(settled) @ whole, motion)
     model.gauge.copy_(motion.to(model.gauge) @ model.gauge)
     trace = motion[free, :3, :3].diagonal(dim1=1, dim2=2).sum(-1)
     return float(((trace - 1) / 2).clamp(-1, 1).acos().mean())
+
+
+def unswayed(rest: Tensor, time_s: np.ndarray, jitter_rad: float, width_s: float = SLOW_S) -> Tensor:
+    """Turns about the origin of object space (T, 4, 4) that take a trunk's slow sway off it, if it is not its own.
+
+    `rest` (T, 4, 4) brings the trunk from object space to rest. What turns of `jitter_rad` a frame leave after
+    smoothing over `width_s` (seconds, a Gaussian's) is known; what the trunk itself does is not, and is taken to be
+    all that is seen. So of a sway that jitter explains alone a half goes, of a smaller one more, of a larger one less.
+    """
+    spacing_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else width_s
+    turns = Rotation.from_matrix(rest[:, :3, :3].double().numpy())
+    middle = turns.mean()
+    slow = gaussian_filter1d((turns * middle.inv()).as_rotvec(), width_s / max(spacing_s, 1e-6), axis=0, mode="nearest")
+    seen = float(np.square(slow).sum(1).mean())
+    left = jitter_rad**2 * spacing_s / (2 * np.sqrt(np.pi) * width_s)
+    share = left / max(left + seen, 1e-12)
+    taken = (middle.inv() * Rotation.from_rotvec(share * slow) * middle).as_matrix()
+    return rigid(torch.from_numpy(taken), torch.zeros(len(rest), 3, dtype=torch.float64)).to(rest.dtype)
 
 
 def rigid_parts(posed: Tensor, free: Tensor, softness: float, rounds: int) -> Tensor:

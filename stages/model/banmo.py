@@ -42,6 +42,8 @@ class VideoFacts:
     principal_px: tuple[float, float]
     root_given: bool = False
     """Somebody gave the root poses: they may move, but their object space is meant."""
+    root_jitter_rad: float = 0.0
+    """Root mean square turn (radians) from frame to frame that was taken out of those before the fit."""
 
 
 @dataclass(frozen=True)
@@ -240,6 +242,7 @@ class Banmo(nn.Module):
                 focal_px=tuple(v["focal_px"]),
                 principal_px=tuple(v["principal_px"]),
                 root_given=bool(v.get("root_given", False)),
+                root_jitter_rad=float(v.get("root_jitter_rad", 0.0)),
             )
             for v in description["videos"]
         ]

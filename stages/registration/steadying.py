@@ -52,6 +52,12 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> tuple[list[np
     return out, (axis_s, around_s), placed_s
 
 
+def jitter(given: np.ndarray, made: np.ndarray) -> float:
+    """Root mean square angle (radians) between rotations of (T, 4, 4) poses and what `steady` made of them."""
+    turns = Rotation.from_matrix(given[:, :3, :3]).inv() * Rotation.from_matrix(made[:, :3, :3])
+    return float(np.sqrt(np.mean(turns.magnitude() ** 2)))
+
+
 def main_axis(turns: list[np.ndarray]) -> np.ndarray:
     """The direction (3,) in object space that moves least in camera space, over clips of rotations (T, 3, 3)."""
     spread = sum(turn.mean(0).T @ turn.mean(0) for turn in turns)

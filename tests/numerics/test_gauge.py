@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from stages.fitting.gauge import align, rigid_parts, settle, steadied
-from stages.geometry.rotations import geodesic_angle, rigid, so3_exp
+from stages.fitting.gauge import align, rigid_parts, settle, steadied, unswayed
+from stages.geometry.rotations import geodesic_angle, invert_rigid, rigid, so3_exp
 from stages.model.banmo import Architecture, Banmo, VideoFacts
 from stages.model.skeleton import Bones
 
@@ -108,3 +109,59 @@ def test_given_root_poses_keep_their_object_space_though_they_may_move(model: Ba
     assert settle(model) > 0.0
     assert torch.equal(model.gauge[:8], torch.eye(4).expand(8, 4, 4))
     assert float((model.gauge[8:] - torch.eye(4)).abs().max()) > 0.01
+
+
+def _swaying(
+    amplitude_rad: float, period_s: float, count: int = 80, fps: float = 20.0
+) -> tuple[torch.Tensor, np.ndarray]:
+    """Motions that bring to rest a trunk that turns to and fro about the vertical axis, and the times."""
+    time = np.arange(count) / fps
+    angle = amplitude_rad * torch.sin(torch.from_numpy(2 * np.pi * time / period_s)).float()
+    turn = so3_exp(torch.stack([torch.zeros(count), angle, torch.zeros(count)], 1))
+    middle = so3_exp(torch.tensor([[0.3, -0.8, 0.2]]))  # how it rests need not be how object space stands
+    return rigid((turn @ middle).transpose(1, 2), torch.zeros(count, 3)), time
+
+
+def _sway(rest: torch.Tensor) -> float:
+    """Root mean square turn (radians) of what is brought to rest about its mean."""
+    turns = Rotation.from_matrix(rest[:, :3, :3].double().numpy())
+    return float(np.sqrt(np.mean((turns * turns.mean().inv()).magnitude() ** 2)))
+
+
+def test_a_slow_sway_that_jitter_explains_goes_to_the_root_and_no_other() -> None:
+    rest, time = _swaying(0.04, 8.0)
+
+    def left(rest: torch.Tensor, jitter_rad: float) -> float:
+        return _sway(rest @ invert_rigid(unswayed(rest, time, jitter_rad))) / _sway(rest)
+
+    assert left(rest, 1.0) < 0.35  # what so strong a jitter leaves is more than is seen
+    assert 0.35 < left(rest, 0.25) < 0.8
+    assert left(rest, 0.02) > 0.98
+    large, _ = _swaying(0.6, 8.0)
+    assert left(large, 0.25) > 0.95  # a body that really sways
+    quick, _ = _swaying(0.04, 0.5)
+    assert left(quick, 1.0) > 0.95
+    still = torch.eye(4).repeat(240, 1, 1)
+    assert torch.allclose(unswayed(still, time, 1.0), still, atol=1e-6)
+
+
+def test_given_root_poses_that_jittered_lose_a_wave_and_no_picture_changes(model: Banmo) -> None:
+    model.videos = [replace(video, root_given=True) for video in model.videos]
+    model.videos[0] = replace(model.videos[0], root_jitter_rad=2.0)
+    with torch.no_grad():
+        model.body.head.out.weight[:3] *= 8  # so that the trunk sways at all
+    time = torch.tensor([0.0, 0.35, 0.7])
+
+    def camera(video: int) -> torch.Tensor:
+        root = model.root_poses(video, time)
+        return model.forward_warp(model.surface, video, time) @ root[:, :3, :3].transpose(1, 2) + root[:, None, :3, 3]
+
+    before = [camera(0), camera(1)]
+    assert settle(model) > 0.0
+    assert torch.equal(model.gauge[8:], torch.eye(4).expand(8, 4, 4))
+    assert float((model.gauge[:8] - torch.eye(4)).abs().max()) > 1e-3
+    assert torch.equal(model.gauge[:, :3, 3], torch.zeros(16, 3))
+    for video in (0, 1):
+        assert torch.allclose(camera(video), before[video], atol=1e-5)
+    again = Banmo.restore(dict(model.state_dict()), model.describe())
+    assert [video.root_jitter_rad for video in again.videos] == [2.0, 0.0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages.registration.steadying import main_axis, steady
+from stages.registration.steadying import jitter, main_axis, steady
 
 FRAMES = 60
 TIME = np.arange(FRAMES) / 20
@@ -95,3 +95,11 @@ def test_a_clip_of_a_few_frames_stays() -> None:
     short = shaken(track(), 20.0)[:5]
     (made,), turned_s, _ = steady([short], [TIME[:5]])
     assert turned_s == (0.0, 0.0) and np.array_equal(made, short)
+
+
+def test_jitter_is_the_root_mean_square_turn_between_two_tracks() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    turned = poses.copy()
+    turned[:2, :3, :3] = Rotation.from_rotvec([[0.0, 0.0, 0.2], [0.2, 0.0, 0.0]]).as_matrix()
+    assert np.isclose(jitter(turned, poses), 0.2 / np.sqrt(2))
+    assert jitter(poses, poses) == 0.0
