@@ -111,11 +111,9 @@ def test_given_root_poses_keep_their_object_space_though_they_may_move(model: Ba
     assert float((model.gauge[8:] - torch.eye(4)).abs().max()) > 0.01
 
 
-def _swaying(
-    amplitude_rad: float, period_s: float, count: int = 80, fps: float = 20.0
-) -> tuple[torch.Tensor, np.ndarray]:
+def _swaying(amplitude_rad: float, period_s: float, count: int = 240) -> tuple[torch.Tensor, np.ndarray]:
     """Motions that bring to rest a trunk that turns to and fro about the vertical axis, and the times."""
-    time = np.arange(count) / fps
+    time = np.arange(count) / 20
     angle = amplitude_rad * torch.sin(torch.from_numpy(2 * np.pi * time / period_s)).float()
     turn = so3_exp(torch.stack([torch.zeros(count), angle, torch.zeros(count)], 1))
     middle = so3_exp(torch.tensor([[0.3, -0.8, 0.2]]))  # how it rests need not be how object space stands
