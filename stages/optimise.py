@@ -77,7 +77,7 @@ class FitSettings(PhaseSettings):
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
     """At the end, move to the root poses what all bones share, so that the trunk rests in object space; given root
-    poses keep theirs."""
+    poses keep theirs, but for what their jitter may have left in them of a slow sway."""
     lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.6
