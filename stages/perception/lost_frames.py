@@ -21,6 +21,8 @@ LEAST_AGREEMENT = 0.8
 right the two overlap by 0.85 and more (fox and dancer: every frame); the classifier's is the coarser."""
 LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
+LEAST_SIZE = 0.5
+"""A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
 _FIT_FRAMES = 48
@@ -66,7 +68,9 @@ def find_again(
             break
     if not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
         return soft, np.zeros(len(soft), bool)
-    lost = agreement < LEAST_AGREEMENT
+    area, again = ((m > 0.5).reshape(len(m), -1).mean(axis=1) for m in (small, found))
+    expected = np.interp(np.arange(len(soft)), np.flatnonzero(steady), area[steady])
+    lost = (agreement < LEAST_AGREEMENT) & (again > LEAST_SIZE * expected)
     mended = soft.copy()
     for t in np.flatnonzero(lost):  # the larger of both: a lost frame lacks pieces, and what it has is mostly right
         mended[t] = np.maximum(soft[t], cv2.resize(found[t], soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR))

@@ -92,6 +92,17 @@ def test_a_clip_without_any_mask_stays_without() -> None:
     assert not lost.any() and not mended.any()
 
 
+def test_what_is_left_of_an_object_that_has_gone_is_not_the_object() -> None:
+    frames, truth, rough = _clip()
+    for t in LOST:  # gone, but for something small that looks like it
+        truth[t] = 0
+        truth[t, 20:36, 40:56] = 1
+        rough[t] = 0.05
+    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    assert not lost.any()
+    np.testing.assert_array_equal(mended, rough)
+
+
 def test_steadiness_sees_a_mask_that_shrank() -> None:
     _, _, rough = _clip()
     trust = steadiness(rough)
