@@ -82,8 +82,9 @@ class FitSettings(PhaseSettings):
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.6
     """Share of the phase at which step sizes begin to fall, linearly, to a tenth."""
-    weight_cover: float = 0.02
-    """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag."""
+    weight_cover: float = 0.0
+    """Pixels of the object that nothing covers pull the surface point nearest to them, in pixels: limbs that lag (with
+    0.02, say). Off: where it was measured the rest does as much."""
     cover_from: float = 0.3
     """Share of the phase from which they do; before, limbs may not be there yet."""
     weight_spill: float = 0.02
