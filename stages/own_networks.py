@@ -44,13 +44,19 @@ class OwnNetwork:
         return dict(zip(self._outputs, self._session.run(None, {"input": inputs.astype(np.float32)}), strict=True))
 
 
-class OwnRefiner:
-    """The network that makes rough masks exact (see stages.perception.refining.RefiningNetwork)."""
+class _OwnFile:
+    """A file of ours, opened."""
 
-    name = "refine.onnx"
+    name: str
 
     def __init__(self, *, device: str = "cpu", threads: int = 1) -> None:
         self._session = open_session(_read(self.name), device, threads)
+
+
+class OwnRefiner(_OwnFile):
+    """The network that makes rough masks exact (see stages.perception.refining.RefiningNetwork)."""
+
+    name = "refine.onnx"
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """(N, S, S) logits of (N, 4, S, S) float32, S a multiple of 16."""
@@ -58,13 +64,10 @@ class OwnRefiner:
         return np.asarray(logit[:, 0])
 
 
-class OwnTrunk:
+class OwnTrunk(_OwnFile):
     """What the categories' networks share (see stages.perception.lost_frames.TrunkNetwork)."""
 
     name = "trunk.onnx"
-
-    def __init__(self, *, device: str = "cpu", threads: int = 1) -> None:
-        self._session = open_session(_read(self.name), device, threads)
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """(N, 64, H/8, W/8) features of (N, 3, H, W) float32, H and W multiples of 16."""

@@ -120,7 +120,7 @@ def _trunk(g: _Graph, network: Network, x: str) -> dict[str, str]:
     fine8 = _up8(g, network, at8, at16)
     fine4 = g.layer(g.op("Add", g.layer(fine8, network.up4), g.layer(at4, network.side4)), network.join4)
     fine2 = g.layer(g.op("Add", g.layer(fine4, network.up2), g.layer(at2, network.side2)), network.join2)
-    return {"at16": at16, "fine8": fine8, "fine4": fine4, "fine2": fine2}
+    return {"at16": at16, "fine4": fine4, "fine2": fine2}
 
 
 def _down(g: _Graph, network: Network, x: str) -> tuple[str, str, str, str]:
@@ -134,6 +134,12 @@ def _down(g: _Graph, network: Network, x: str) -> tuple[str, str, str, str]:
 def _up8(g: _Graph, network: Network, at8: str, at16: str) -> str:
     """Features at an eighth of the size, on the way up."""
     return g.layer(g.op("Add", g.layer(at16, network.up8), g.layer(at8, network.side8)), network.join8)
+
+
+def _unmasked(g: _Graph, image: str) -> str:
+    """A picture and a fourth channel of zeros: no mask is known."""
+    zero = g.constant(np.array(0, np.float32))
+    return g.op("Concat", image, g.op("Mul", g.op("ReduceMean", image, axes=[1], keepdims=1), zero), axis=1)
 
 
 def _halve(g: _Graph, x: str) -> str:
@@ -168,8 +174,7 @@ def cse_model(network: Network, category: int, provenance: dict[str, str]) -> on
     """Picture N x 3 x H x W -> `dense` N x 17 x H/2 x W/2."""
     g = _Graph()
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, "h", "w"])
-    none = g.op("Mul", g.op("ReduceMean", "image", axes=[1], keepdims=1), g.constant(np.array(0, np.float32)))
-    parts = _trunk(g, network, _halve(g, g.op("Concat", "image", none, axis=1)))
+    parts = _trunk(g, network, _halve(g, _unmasked(g, "image")))
     outputs = {"dense": (_dense(g, network, parts, category), ["n", 1 + EMBEDDING, "h2", "w2"])}
     return _finish(g, [image], outputs, f"cse-{CATEGORIES[category]}", provenance)
 
@@ -178,8 +183,7 @@ def trunk_model(network: Network, provenance: dict[str, str]) -> onnx.ModelProto
     """Picture N x 3 x H x W -> `features` N x 64 x H/8 x W/8 of the trunk on its way up; nothing beyond them."""
     g = _Graph()
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, "h", "w"])
-    none = g.op("Mul", g.op("ReduceMean", "image", axes=[1], keepdims=1), g.constant(np.array(0, np.float32)))
-    at8, at16 = _down(g, network, _halve(g, g.op("Concat", "image", none, axis=1)))[2:]
+    at8, at16 = _down(g, network, _halve(g, _unmasked(g, "image")))[2:]
     outputs = {"features": (_up8(g, network, at8, at16), ["n", network.join8[0].out_channels, "h8", "w8"])}
     return _finish(g, [image], outputs, "trunk", provenance)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from stages.perception.appearance import PixelColours, coloured_surroundings
-from stages.perception.temporal import intersection_over_union, main_component, resize_maps
+from stages.perception.temporal import intersection_over_union, main_component, resize_maps, signed_distance
 from stages.perception.viewpoint import normalised
 
 LEAST_AGREEMENT = 0.8
@@ -78,7 +78,7 @@ def find_again(
 
 
 def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:
-    """(T, H/8, W/8, C) float32 of frames (H, W, 3) uint8 RGB, each resized to the next multiple of sixteen."""
+    """(T, H/8, W/8, C) float32 of frames (H, W, 3) uint8 RGB, each resized to the nearest multiples of sixteen."""
     height, width = (max(_MULTIPLE, round(n / _MULTIPLE) * _MULTIPLE) for n in work[0].shape[:2])
     out = []
     for first in range(0, len(work), _BATCH):
@@ -103,7 +103,7 @@ def _fitted(colours: np.ndarray, features: np.ndarray, soft: np.ndarray, seed: i
         return None
     values = np.stack([_seen(colours[t], features[t]) for t in chosen])
     inside = soft[chosen] > 0.5
-    away = np.stack([_distance_to_outline(m) > _RIM_PX for m in inside])
+    away = np.stack([np.abs(signed_distance(m)) > _RIM_PX for m in inside])
     classifier = PixelColours(values.shape[-1], seed)
     weight = away * trust[chosen, None, None].astype(np.float32)
     return (
@@ -121,8 +121,3 @@ def _seen(colours: np.ndarray, features: np.ndarray) -> np.ndarray:
     """(h, w, K + C): both at the size of the colours."""
     size = colours.shape[1], colours.shape[0]
     return np.concatenate([colours, cv2.resize(features, size, interpolation=cv2.INTER_LINEAR)], axis=-1)
-
-
-def _distance_to_outline(mask: np.ndarray) -> np.ndarray:
-    eight = mask.astype(np.uint8)
-    return cv2.distanceTransform(eight, cv2.DIST_L2, 3) + cv2.distanceTransform(1 - eight, cv2.DIST_L2, 3)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from stages.perception.background import to_lab
+from stages.perception.temporal import signed_distance
 
 _LAB_SCALE = np.array([2.55, 1.0, 1.0], np.float32)
 """Lightness shows an outline better than hue, and survives compression."""
@@ -24,8 +25,7 @@ def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float =
     What is certain, 0 or 1, and not near the outline, stays so: a fit takes these values as the opacity that it wants.
     """
     rim_px = 0.375 * reach_px
-    inside = (probability > 0.5).astype(np.uint8)
-    depth = cv2.distanceTransform(inside, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 3)
+    depth = signed_distance(probability > 0.5)
     lab = to_lab(image) * _LAB_SCALE
     front, front_spread, front_known = _local_colours(lab, depth >= rim_px, reach_px / 2)
     beside = (depth <= -rim_px) & (depth > -3.5 * reach_px)

@@ -25,7 +25,7 @@ from stages.perception.lost_frames import TrunkNetwork, find_again
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
 from stages.perception.refining import RefiningNetwork, refine
-from stages.perception.temporal import flow_median, main_component, resize_maps
+from stages.perception.temporal import flow_median, main_component, resize_maps, signed_distance
 
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
@@ -185,7 +185,7 @@ def tight_probability(
     inside the coarse outline, which is about as fat as the rim.
     """
     values = np.stack([scaled_lab(image) for image in work])
-    depth = np.stack([_signed_distance(s > 0.5) for s in soft])
+    depth = np.stack([signed_distance(s > 0.5) for s in soft])
     # Well inside the outline is the object whatever its colour.
     within = 0.3 * np.clip(depth - 2.5 * rim_px, 0, 12)
     found = soft
@@ -299,13 +299,6 @@ def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
     blurred = np.stack([cv2.GaussianBlur(m.astype(np.float32), (0, 0), sigma_px) for m in maps])
     top = np.quantile(blurred.reshape(len(maps), -1), 0.99, axis=1)
     return blurred / np.maximum(top, 0.1)[:, None, None]
-
-
-def _signed_distance(mask: np.ndarray) -> np.ndarray:
-    """(h, w) distance to the outline in pixels, positive inside."""
-    eight = mask.astype(np.uint8)
-    inside = cv2.distanceTransform(eight, cv2.DIST_L2, 3)
-    return np.where(mask, inside, -cv2.distanceTransform(1 - eight, cv2.DIST_L2, 3)).astype(np.float32)
 
 
 def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -130,3 +130,10 @@ def resize_maps(maps: np.ndarray, width: int, height: int) -> np.ndarray:
     """(T, height, width) float32 of maps of another size."""
     kind = cv2.INTER_AREA if width < maps.shape[2] else cv2.INTER_LINEAR
     return np.stack([cv2.resize(m.astype(np.float32), (width, height), interpolation=kind) for m in maps])
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """(h, w) distance to the outline in pixels, positive inside."""
+    eight = mask.astype(np.uint8)
+    inside = cv2.distanceTransform(eight, cv2.DIST_L2, 3)
+    return np.where(mask, inside, -cv2.distanceTransform(1 - eight, cv2.DIST_L2, 3)).astype(np.float32)
