@@ -7,7 +7,9 @@
 4. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
    size. Anything else: the same again on plain colours, leaving the uncertain rim of the mask out of the fit; this
    tightens the outline.
-5. Flicker is voted away along the flow, and the outline is settled at full resolution.
+5. Pieces that look like the background are added where other frames of the clip show it, and here it is not to be
+   seen (`missing_pieces`).
+6. Flicker is voted away along the flow, and the outline is settled at full resolution.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 from stages.perception.appearance import PixelColours, coloured_surroundings, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
 from stages.perception.lost_frames import TrunkNetwork, find_again
+from stages.perception.missing_pieces import with_missing_pieces
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
 from stages.perception.refining import RefiningNetwork, refine
@@ -56,6 +59,7 @@ class Segmentation:
     prior: str = ""  # the category whose network had a say
     refined: bool = False  # whether a network went over the rough mask
     found_again: int = 0  # frames in which colours and motion had lost the object
+    mended: int = 0  # frames that gained a piece the background had hidden
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,13 @@ def segment(
     else:
         soft = tight_probability(work, soft, cues, known, effort)
     tick(2, 2, "learning")
+    soft, gained = with_missing_pieces(
+        work, soft, told, carrier.to_next, carrier.to_previous, effort.seed,
+        lambda done, total: tick(done, total, "backdrop"),
+    )  # fmt: skip
     found = finish(images, soft, carrier)
-    return Segmentation(found.probability, found.agreement, chosen, refined, again)
+    mended = int(np.count_nonzero(gained))
+    return Segmentation(found.probability, found.agreement, chosen, refined, again, mended)
 
 
 # --------------------------------------------------------------------------------------------- the steps
