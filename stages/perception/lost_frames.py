@@ -7,6 +7,7 @@ and read where they are not.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
@@ -23,6 +24,8 @@ LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
 LEAST_SIZE = 0.5
 """A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
+WORSE_THAN_USUAL = 0.1
+"""So much less overlap than the clip's frames usually have, in any of them, asks for a second look at refined masks."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
 _FIT_FRAMES = 48
@@ -40,14 +43,24 @@ class TrunkNetwork(Protocol):
         ...
 
 
-def find_again(
-    work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rough probability (T, h, w) in 0..1 with lost frames mended, and which those are, (T,) bool.
+@dataclass(frozen=True)
+class Found:
+    """Masks with lost frames mended.
 
-    `soft` is the rough probability of the frames `work` (h, w, 3) uint8 RGB, `told` (T, h, w) log-odds from hints.
-    Other frames come back as they are; so does every frame of a clip in which the features do not tell the object.
-    Worked out at half the size.
+    `probability` (T, h, w) float32 in 0..1; `lost` (T,) bool: which frames were mended; `said` (T, h/2, w/2) float32:
+    what the classifier says of every frame, None where the features do not tell the object.
+    """
+
+    probability: np.ndarray
+    lost: np.ndarray
+    said: np.ndarray | None
+
+
+def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int) -> Found:
+    """Lost frames mended in rough masks: probability `soft` (T, h, w) of the frames `work` (h, w, 3) uint8 RGB.
+
+    `told` (T, h, w) are log-odds from hints. Other frames come back as they are; so does every frame of a clip in which
+    the features do not tell the object. Worked out at half the size.
     """
     height, width = soft.shape[1] // 2, soft.shape[2] // 2
     colours = np.stack(
@@ -67,14 +80,38 @@ def find_again(
         if (agreement >= LEAST_AGREEMENT).all():
             break
     if not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
-        return soft, np.zeros(len(soft), bool)
+        return Found(soft, np.zeros(len(soft), bool), None)
     area, again = ((m > 0.5).reshape(len(m), -1).mean(axis=1) for m in (small, found))
     expected = np.interp(np.arange(len(soft)), np.flatnonzero(steady), area[steady])
     lost = (agreement < LEAST_AGREEMENT) & (again > LEAST_SIZE * expected)
     mended = soft.copy()
     for t in np.flatnonzero(lost):  # the larger of both: a lost frame lacks pieces, and what it has is mostly right
         mended[t] = np.maximum(soft[t], cv2.resize(found[t], soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR))
-    return mended, lost
+    return Found(mended, lost, found)
+
+
+def look_again(
+    work: list[np.ndarray], refined: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int, first: Found
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refined masks (T, H, W) in which no frame lost a part that it should have, and which frames gained, (T,) bool.
+
+    Refining may drop a head in the shade. Where some frame agrees with what the `first` look said by much less than
+    the clip's frames do, the classifier is taught anew, by the refined masks, which are better teachers.
+    """
+    none = np.zeros(len(refined), bool)
+    if first.said is None:
+        return refined, none
+    small = resize_maps(refined, first.said.shape[2], first.said.shape[1])
+    overlap = np.array([intersection_over_union(a > 0.5, b > 0.5) for a, b in zip(small, first.said, strict=True)])
+    if (overlap >= np.median(overlap) - WORSE_THAN_USUAL).all():
+        return refined, none
+    height, width = work[0].shape[:2]
+    second = find_again(work, resize_maps(refined, width, height), told, network, seed)
+    out = refined.copy()
+    for t in np.flatnonzero(second.lost):
+        again = cv2.resize(second.probability[t], refined.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
+        out[t] = np.maximum(refined[t], again)
+    return out, second.lost
 
 
 def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:

@@ -3,7 +3,8 @@
 1. Motion against the background gives each frame sharp but sparse evidence (`background.motion_cues`).
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
-3. Where that lost an object of a known category, features of the categories' network find it again (`lost_frames`).
+3. Where that lost an object of a known category, features of the categories' network find it again (`lost_frames`);
+   once more after the next step, where that has lost a part.
 4. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
    size. Anything else: the same again on plain colours, leaving the uncertain rim of the mask out of the fit; this
    tightens the outline.
@@ -23,7 +24,7 @@ import numpy as np
 
 from stages.perception.appearance import PixelColours, coloured_surroundings, scaled_lab
 from stages.perception.background import MotionCues, border_distance, motion_cues, shrink
-from stages.perception.lost_frames import TrunkNetwork, find_again
+from stages.perception.lost_frames import TrunkNetwork, find_again, look_again
 from stages.perception.missing_pieces import with_missing_pieces
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
@@ -128,14 +129,17 @@ def segment(
         known = told
     soft = coarse_probability(work, cues, known, carrier, effort)
     tick(1, 2, "learning")
-    again = 0
+    lost, found = np.zeros(len(work), bool), None
     if trunk is not None and chosen:
-        soft, lost = find_again(work, soft, told, trunk, effort.seed)
-        again = int(lost.sum())
+        found = find_again(work, soft, told, trunk, effort.seed)
+        soft, lost = found.probability, found.lost
     refined = refiner is not None and bool(chosen) and effort.refinements > 0
     if refiner is not None and refined:
         # Not of a tightened mask: where colours were wrong, that one has lost what the network would have seen.
         soft = refined_probability(images, soft, told, refiner, effort)
+        if trunk is not None and found is not None:
+            soft, more = look_again(work, soft, told, trunk, effort.seed, found)
+            lost = lost | more
     else:
         soft = tight_probability(work, soft, cues, known, effort)
     tick(2, 2, "learning")
@@ -143,9 +147,9 @@ def segment(
         work, soft, told, carrier.to_next, carrier.to_previous, effort.seed,
         lambda done, total: tick(done, total, "backdrop"),
     )  # fmt: skip
-    found = finish(images, soft, carrier)
-    mended = int(np.count_nonzero(gained))
-    return Segmentation(found.probability, found.agreement, chosen, refined, again, mended)
+    last = finish(images, soft, carrier)
+    again, mended = int(lost.sum()), int(np.count_nonzero(gained))
+    return Segmentation(last.probability, last.agreement, chosen, refined, again, mended)
 
 
 # --------------------------------------------------------------------------------------------- the steps

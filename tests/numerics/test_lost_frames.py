@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from stages.own_networks import OwnTrunk
-from stages.perception.lost_frames import find_again, steadiness, trunk_features
+from stages.perception.lost_frames import Found, find_again, look_again, steadiness, trunk_features
 from stages.perception.temporal import intersection_over_union
 
 COUNT, HEIGHT, WIDTH = 24, 64, 96
@@ -23,7 +23,7 @@ class _Knowing:
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         out = self.rng.normal(0, 0.2, (len(inputs), 4, HEIGHT // 8, WIDTH // 8)).astype(np.float32)
         for k in range(len(inputs)):
-            small = cv2.resize(self.truth[self.at], (WIDTH // 8, HEIGHT // 8), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(self.truth[self.at % COUNT], (WIDTH // 8, HEIGHT // 8), interpolation=cv2.INTER_AREA)
             out[k, 1] += 0.0 if self.blind else 2 * small
             self.at += 1
         return out
@@ -45,13 +45,20 @@ def _clip() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     return frames, truth, rough.astype(np.float32)
 
 
+def _found(
+    frames: list[np.ndarray], rough: np.ndarray, network: _Knowing, told: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    found = find_again(frames, rough, np.zeros_like(rough) if told is None else told, network, seed=0)
+    return found.probability, found.lost
+
+
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:
     return intersection_over_union(a > 0.5, b > 0.5)
 
 
 def test_what_features_tell_is_found_again_and_the_rest_stays() -> None:
     frames, truth, rough = _clip()
-    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    mended, lost = _found(frames, rough, _Knowing(truth))
     assert np.flatnonzero(lost).tolist() == list(LOST)
     assert max(_overlap(rough[t], truth[t]) for t in LOST) < 0.4
     assert min(_overlap(mended[t], truth[t]) for t in LOST) > 0.8
@@ -60,10 +67,10 @@ def test_what_features_tell_is_found_again_and_the_rest_stays() -> None:
 
 def test_features_that_tell_nothing_find_nothing() -> None:
     frames, truth, rough = _clip()
-    mended, _ = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth, blind=True), seed=0)
+    mended, _ = _found(frames, rough, _Knowing(truth, blind=True))
     assert max(_overlap(mended[t], truth[t]) for t in LOST) < 0.5
     grey = [np.full((HEIGHT, WIDTH, 3), 90, np.uint8)] * COUNT  # nor do colours here: the classifier learns nothing
-    untouched, lost = find_again(grey, rough, np.zeros_like(rough), _Knowing(truth, blind=True), seed=0)
+    untouched, lost = _found(grey, rough, _Knowing(truth, blind=True))
     assert not lost.any()
     np.testing.assert_array_equal(untouched, rough)
 
@@ -71,7 +78,7 @@ def test_features_that_tell_nothing_find_nothing() -> None:
 def test_a_clip_that_lost_nothing_comes_back_as_it_was() -> None:
     frames, truth, _ = _clip()
     rough = (0.05 + 0.9 * truth).astype(np.float32)
-    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    mended, lost = _found(frames, rough, _Knowing(truth))
     assert not lost.any()
     np.testing.assert_array_equal(mended, rough)
 
@@ -80,7 +87,7 @@ def test_a_hint_counts_where_features_say_otherwise() -> None:
     frames, truth, rough = _clip()
     told = np.zeros_like(rough)
     told[LOST, :, :30] = -20.0
-    mended, _ = find_again(frames, rough, told, _Knowing(truth), seed=0)
+    mended, _ = _found(frames, rough, _Knowing(truth), told)
     beyond = mended - rough
     assert not (beyond[LOST, :, :26] > 0.01).any() and (beyond[LOST, :, 34:] > 0.5).any()
 
@@ -88,7 +95,7 @@ def test_a_hint_counts_where_features_say_otherwise() -> None:
 def test_a_clip_without_any_mask_stays_without() -> None:
     frames, truth, _ = _clip()
     nothing = np.zeros_like(truth)
-    mended, lost = find_again(frames, nothing, nothing, _Knowing(truth), seed=0)
+    mended, lost = _found(frames, nothing, _Knowing(truth))
     assert not lost.any() and not mended.any()
 
 
@@ -98,9 +105,40 @@ def test_what_is_left_of_an_object_that_has_gone_is_not_the_object() -> None:
         truth[t] = 0
         truth[t, 20:36, 40:56] = 1
         rough[t] = 0.05
-    mended, lost = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    mended, lost = _found(frames, rough, _Knowing(truth))
     assert not lost.any()
     np.testing.assert_array_equal(mended, rough)
+
+
+def test_a_part_that_refining_dropped_comes_back() -> None:
+    """At twice the size, as refined masks may be; frames that kept all of it stay as they are."""
+    frames, truth, _ = _clip()
+    rough = (0.05 + 0.9 * truth).astype(np.float32)
+    zeros = np.zeros_like(rough)
+    first = find_again(frames, rough, zeros, _Knowing(truth), seed=0)
+    assert not first.lost.any() and first.said is not None
+    large = np.stack([cv2.resize(m, (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_NEAREST) for m in truth])
+    refined = large.copy()
+    refined[11, :, : 2 * (26 + 2 * 11)] = 0
+    out, lost = look_again(frames, refined, zeros, _Knowing(truth), 0, first)
+    assert np.flatnonzero(lost).tolist() == [11]
+    assert _overlap(refined[11], large[11]) < 0.6 and _overlap(out[11], large[11]) > 0.8
+    np.testing.assert_array_equal(np.delete(out, 11, 0), np.delete(refined, 11, 0))
+
+
+def test_masks_that_lost_nothing_are_not_looked_at_again() -> None:
+    frames, truth, rough = _clip()
+    zeros = np.zeros_like(rough)
+    asked = _Knowing(truth)
+    first = find_again(frames, rough, zeros, asked, seed=0)
+    count = asked.at
+    same, lost = look_again(frames, truth, zeros, asked, 0, first)
+    assert asked.at == count and not lost.any()
+    np.testing.assert_array_equal(same, truth)
+    unknown = Found(rough, np.zeros(COUNT, bool), None)  # the first look told nothing, so there is none to compare
+    same, _ = look_again(frames, rough, zeros, asked, 0, unknown)
+    assert asked.at == count
+    np.testing.assert_array_equal(same, rough)
 
 
 def test_steadiness_sees_a_mask_that_shrank() -> None:
