@@ -24,6 +24,8 @@ LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
 LEAST_SIZE = 0.5
 """A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
+LEAST_REFINED_AGREEMENT = 0.85
+"""The same of refined masks, which teach better."""
 WORSE_THAN_USUAL = 0.1
 """So much less overlap than the clip's frames usually have, in any of them, asks for a second look at refined masks."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
@@ -56,10 +58,17 @@ class Found:
     said: np.ndarray | None
 
 
-def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int) -> Found:
+def find_again(
+    work: list[np.ndarray],
+    soft: np.ndarray,
+    told: np.ndarray,
+    network: TrunkNetwork,
+    seed: int,
+    least: float = LEAST_AGREEMENT,
+) -> Found:
     """Lost frames mended in rough masks: probability `soft` (T, h, w) of the frames `work` (h, w, 3) uint8 RGB.
 
-    `told` (T, h, w) are log-odds from hints. Other frames come back as they are; so does every frame of a clip in which
+    `told` (T, h, w) are log-odds from hints; `least` is the overlap below which a frame counts as lost. Other frames come back as they are; so does every frame of a clip in which
     the features do not tell the object. Worked out at half the size.
     """
     height, width = soft.shape[1] // 2, soft.shape[2] // 2
@@ -77,13 +86,13 @@ def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, netwo
             break
         found = np.stack([_read(classifier, *each) for each in zip(colours, features, hints, strict=True)])
         agreement = np.array([intersection_over_union(a > 0.5, b > 0.5) for a, b in zip(small, found, strict=True)])
-        if (agreement >= LEAST_AGREEMENT).all():
+        if (agreement >= least).all():
             break
     if not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
         return Found(soft, np.zeros(len(soft), bool), None)
     area, again = ((m > 0.5).reshape(len(m), -1).mean(axis=1) for m in (small, found))
     expected = np.interp(np.arange(len(soft)), np.flatnonzero(steady), area[steady])
-    lost = (agreement < LEAST_AGREEMENT) & (again > LEAST_SIZE * expected)
+    lost = (agreement < least) & (again > LEAST_SIZE * expected)
     mended = soft.copy()
     for t in np.flatnonzero(lost):  # the larger of both: a lost frame lacks pieces, and what it has is mostly right
         mended[t] = np.maximum(soft[t], cv2.resize(found[t], soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR))
@@ -93,10 +102,10 @@ def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, netwo
 def look_again(
     work: list[np.ndarray], refined: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int, first: Found
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refined masks (T, H, W) in which no frame lost a part that it should have, and which frames gained, (T,) bool.
+    """Refined masks (T, H, W) with what some frames lost, roughly, and which frames those are, (T,) bool.
 
     Refining may drop a head in the shade. Where some frame agrees with what the `first` look said by much less than
-    the clip's frames do, the classifier is taught anew, by the refined masks, which are better teachers.
+    the clip's frames do, the classifier is taught anew, by the refined masks. What it finds is to be refined again.
     """
     none = np.zeros(len(refined), bool)
     if first.said is None:
@@ -106,7 +115,7 @@ def look_again(
     if (overlap >= np.median(overlap) - WORSE_THAN_USUAL).all():
         return refined, none
     height, width = work[0].shape[:2]
-    second = find_again(work, resize_maps(refined, width, height), told, network, seed)
+    second = find_again(work, resize_maps(refined, width, height), told, network, seed, LEAST_REFINED_AGREEMENT)
     out = refined.copy()
     for t in np.flatnonzero(second.lost):
         again = cv2.resize(second.probability[t], refined.shape[:0:-1], interpolation=cv2.INTER_LINEAR)

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import cv2
@@ -37,6 +37,7 @@ MOTION_SIDE_PX = 192  # motion tells no more at 256, at five times the work
 CARRY_SIDE_PX = 128
 LEAST_PRIOR_AREA = 2e-3
 LEAST_PRIOR_SCORE = 0.35
+REFINED_AGAIN = 2  # times, where a part was lost: a head comes back half by the first, whole by the second
 OUTLINE_REACH_PX = 4.0  # at the working size
 Tick = Callable[[int, int, str], None]
 
@@ -139,6 +140,9 @@ def segment(
         soft = refined_probability(images, soft, told, refiner, effort)
         if trunk is not None and found is not None:
             soft, more = look_again(work, soft, told, trunk, effort.seed, found)
+            if more.any():
+                again = replace(effort, refinements=REFINED_AGAIN)
+                soft[more] = refined_probability(images[more], soft[more], told[more], refiner, again)
             lost = lost | more
     else:
         soft = tight_probability(work, soft, cues, known, effort)
@@ -148,8 +152,9 @@ def segment(
         lambda done, total: tick(done, total, "backdrop"),
     )  # fmt: skip
     last = finish(images, soft, carrier)
-    again, mended = int(lost.sum()), int(np.count_nonzero(gained))
-    return Segmentation(last.probability, last.agreement, chosen, refined, again, mended)
+    return Segmentation(
+        last.probability, last.agreement, chosen, refined, int(lost.sum()), int(np.count_nonzero(gained))
+    )
 
 
 # --------------------------------------------------------------------------------------------- the steps
