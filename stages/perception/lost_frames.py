@@ -68,8 +68,9 @@ def find_again(
 ) -> Found:
     """Lost frames mended in rough masks: probability `soft` (T, h, w) of the frames `work` (h, w, 3) uint8 RGB.
 
-    `told` (T, h, w) are log-odds from hints; `least` is the overlap below which a frame counts as lost. Other frames come back as they are; so does every frame of a clip in which
-    the features do not tell the object. Worked out at half the size.
+    `told` (T, h, w) are log-odds from hints; `least` is the overlap below which a frame counts as lost. Other frames
+    come back as they are; so does every frame of a clip in which the features do not tell the object. Worked out at
+    half the size.
     """
     height, width = soft.shape[1] // 2, soft.shape[2] // 2
     colours = np.stack(
