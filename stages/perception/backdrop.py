@@ -113,7 +113,7 @@ def registered(
                     break
                 nearer = back[t - 1] if way > 0 else forth[t]
                 at = _looked_up(at, grid + enlarge(nearer, width, height))
-                left, _ = background_flow(matcher(grey[t], _looked_up(grey[anchor], at)), trust[t], basis, 1024)
+                left, _ = background_flow(matcher(grey[t], _looked_up(grey[anchor], at)), trust[t], basis, 512)
                 at = _looked_up(at, grid + left)
                 if abs(t - anchor) >= ANCHOR_NEAR:
                     yield t, anchor, at

@@ -11,10 +11,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.perception.appearance import PixelColours, coloured_surroundings
+from stages.perception.appearance import LOGIT_LIMIT, PixelColours, coloured_surroundings
 from stages.perception.backdrop import Contradiction, Tick, contradiction
 from stages.perception.optical_flow import sample
-from stages.perception.temporal import resize_maps, signed_distance
+from stages.perception.temporal import mask_box, resize_maps, signed_distance
 
 REACH_PX = 20.0
 """How far from the mask a piece may stretch, at the working size of 256."""
@@ -149,24 +149,34 @@ def _looks(
     weight[added] = np.clip(evidence[added] / 2, 0.1, 1)
     values, labels, weights = [], [], []
     for t in np.unique(np.linspace(0, len(work) - 1, min(_TAUGHT_FRAMES, len(work))).round().astype(int)):
-        other = np.flatnonzero((weight[t] > 0) & ~added[t])
+        part = _window(beside[t])
+        new, heavy = added[t][part].ravel(), weight[t][part].ravel()
+        other = np.flatnonzero((heavy > 0) & ~new)
         other = draw.choice(other, min(_TAUGHT_PER_FRAME, len(other)), replace=False)
-        chosen = np.union1d(np.flatnonzero(added[t]), other)
-        values.append(coloured_surroundings(work[t]).reshape(-1, 12)[chosen])
-        labels.append(added[t].ravel()[chosen])
-        weights.append(weight[t].ravel()[chosen])
+        chosen = np.union1d(np.flatnonzero(new), other)
+        colours = coloured_surroundings(work[t][part])
+        values.append(colours.reshape(-1, colours.shape[-1])[chosen])
+        labels.append(new[chosen])
+        weights.append(heavy[chosen])
     stacked = np.concatenate(values)
     classifier = PixelColours(stacked.shape[-1], seed)
     if not classifier.fit(stacked, np.concatenate(labels), np.concatenate(weights), steps=_STEPS, batch=_PIXELS):
         return None
     out = np.full(evidence.shape, _UNSEEN, np.float32)
     for t, image in enumerate(work):
-        near = ~inside[t] & (away[t] < REACH_PX)
+        part = _window(beside[t])
+        near = ~inside[t][part] & (away[t][part] < REACH_PX)
         if near.any():
-            seen = np.full(near.shape, -6.0, np.float32)
-            seen[near] = classifier.logit(coloured_surroundings(image)[near])
-            out[t][near] = cv2.GaussianBlur(seen, (0, 0), 0.7)[near]
+            seen = np.full(near.shape, -LOGIT_LIMIT, np.float32)
+            seen[near] = classifier.logit(coloured_surroundings(image[part])[near])
+            out[t][part][near] = cv2.GaussianBlur(seen, (0, 0), 0.7)[near]
     return out
+
+
+def _window(mask: np.ndarray) -> tuple[slice, slice]:
+    """The part of a frame that holds the whole mask, and at least a pixel."""
+    x0, y0, x1, y1 = (int(v) for v in mask_box(mask))
+    return slice(y0, max(y1, y0 + 1)), slice(x0, max(x1, x0 + 1))
 
 
 def _disc(radius: int) -> np.ndarray:
