@@ -89,7 +89,7 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
         run.metric("refined_by", refiner.name if result.refined else "none")
         run.metric("frames_found_again", result.found_again)
         run.metric("found_again_by", trunk.name if result.found_again else "none")
-        run.metric("frames_mended", result.mended)
+        run.metric("frames_with_pieces_added", result.with_pieces)
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
     facts = _facts(provider, result, clip, settings.threshold)

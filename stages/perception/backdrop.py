@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 
 from stages.perception.background import background_flow, polynomial_basis
-from stages.perception.optical_flow import Matcher, pixel_grid
-from stages.perception.temporal import enlarge, mask_box
+from stages.perception.optical_flow import Matcher, compose, pixel_grid
+from stages.perception.temporal import disc, enlarge, mask_box
 
 ANCHOR_STEP = 8
 """Every so many frames one is compared with those around it."""
@@ -63,8 +63,8 @@ def contradiction(
     count, height, width = masks.shape
     lightness = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) * (100 / 255) for image in work]
     eight = masks.astype(np.uint8)
-    free = [(cv2.dilate(m, _disc(_SKIN_PX)) == 0).astype(np.float32) for m in eight]
-    clear = [(cv2.dilate(m, _disc(_CLEAR_PX)) == 0).astype(np.float32) for m in eight]
+    free = [(cv2.dilate(m, disc(_SKIN_PX)) == 0).astype(np.float32) for m in eight]
+    clear = [(cv2.dilate(m, disc(_CLEAR_PX)) == 0).astype(np.float32) for m in eight]
     windows = [_window(m) for m in masks]
     total, weight = np.zeros((2, count, height, width), np.float32)
     for t, anchor, at in registered(work, eight, to_next, to_previous, tick):
@@ -112,17 +112,25 @@ def registered(
                 if not 0 <= t < count:
                     break
                 nearer = back[t - 1] if way > 0 else forth[t]
-                at = _looked_up(at, grid + enlarge(nearer, width, height))
+                at = _joined(at, enlarge(nearer, width, height), grid)
                 left, _ = background_flow(matcher(grey[t], _looked_up(grey[anchor], at)), trust[t], basis, 512)
-                at = _looked_up(at, grid + left)
+                at = _joined(at, left, grid)
                 if abs(t - anchor) >= ANCHOR_NEAR:
                     yield t, anchor, at
         tick(done + 1, len(anchors))
 
 
+def _joined(at: np.ndarray, flow: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Where a frame's pixels are in the anchor, by their flow to a frame whose pixels are there at `at`.
+
+    Beyond that frame's border its motion goes on, so that what enters the picture is known to be outside the anchor's.
+    """
+    return grid + compose(flow, at - grid, grid)
+
+
 def _registration_trust(mask: np.ndarray) -> np.ndarray:
     """(h, w) how far a pixel's motion counts as the background's: most around the object, not at all on it."""
-    fat = cv2.dilate(mask, _disc(_FAT_PX))
+    fat = cv2.dilate(mask, disc(_FAT_PX))
     ring = cv2.dilate(fat, np.ones((2 * _RING_PX + 1, 2 * _RING_PX + 1), np.uint8))
     return np.where(fat > 0, 0.0, np.where(ring > 0, 1.0, 0.3)).astype(np.float32)
 
@@ -201,7 +209,3 @@ def _around(values: np.ndarray) -> np.ndarray:
     height, width = values.shape
     small = cv2.resize(values, (max(1, width // 4), max(1, height // 4)), interpolation=cv2.INTER_AREA)
     return cv2.resize(cv2.GaussianBlur(small, (0, 0), _AROUND_PX / 4), (width, height), interpolation=cv2.INTER_LINEAR)
-
-
-def _disc(radius: int) -> np.ndarray:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

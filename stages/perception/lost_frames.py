@@ -20,12 +20,12 @@ from stages.perception.viewpoint import normalised
 LEAST_AGREEMENT = 0.8
 """Overlap of a frame's rough mask and what the classifier says below which the frame counts as lost. Where masks are
 right the two overlap by 0.85 and more (fox and dancer: every frame); the classifier's is the coarser."""
+LEAST_REFINED_AGREEMENT = 0.85
+"""The same of refined masks, which teach better."""
 LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
 LEAST_SIZE = 0.5
 """A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
-LEAST_REFINED_AGREEMENT = 0.85
-"""The same of refined masks, which teach better."""
 WORSE_THAN_USUAL = 0.1
 """So much less overlap than the clip's frames usually have, in any of them, asks for a second look at refined masks."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is

@@ -1,9 +1,9 @@
 """Pieces of the object that look like its background, added to masks where the background is seen not to be there.
 
 Evidence that other frames contradict (`backdrop`) is averaged along the flow; what it finds in some frames teaches a
-classifier of colours how the missing piece looks, which helps to decide in the others. Looks alone never add a pixel;
-and where the pieces do not look alike, and unlike what is around them, it is not a piece of one object that was found
-but the depth of the background, and none is added.
+classifier of colours how the missing piece looks, which helps to decide in the others. Where the pieces do not look
+alike, and unlike what is around them, it is not a piece of one object that was found but the depth of the background,
+and none is added.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ import numpy as np
 from stages.perception.appearance import LOGIT_LIMIT, PixelColours, coloured_surroundings
 from stages.perception.backdrop import Contradiction, Tick, contradiction
 from stages.perception.optical_flow import sample
-from stages.perception.temporal import mask_box, resize_maps, signed_distance
+from stages.perception.temporal import disc, mask_box, resize_maps, signed_distance
 
 REACH_PX = 20.0
 """How far from the mask a piece may stretch, at the working size of 256."""
 FIRST_BAR, BAR = 0.5, 1.0
 """Log-odds that a pixel must reach, before and with its looks."""
 LOOKS_SHARE, LOOKS_LIMIT = 0.3, 3.0
-"""How much the classifier's log-odds (and 1, for it sees a third of objects) count, and up to where."""
+"""How much the classifier's log-odds count (raised by 1, what its diet of one third object takes), and up to where:
+alone they pass the bar only where they are very sure."""
 LEAST_ALIKE = 0.88
 """Share of both the pieces and the background that must be told right by looks, or else nothing was found. Shoes on
-five kinds of ground and paws in grass give 0.92 and more, furniture at many depths 0.83 and less."""
+five kinds of ground and paws in grass give 0.90 and more, furniture at many depths 0.84 and less."""
 LEAST_PX = 12
 LARGEST_SHARE = 0.5
 """A piece larger than this share of the mask is none: something else came by."""
@@ -70,7 +71,8 @@ def with_missing_pieces(
         added = pieces(both - BAR, inside, away, near)
     out = soft.astype(np.float32, copy=True)
     for t in np.flatnonzero(added.reshape(len(added), -1).any(axis=1)):
-        sure = cv2.resize(added[t].astype(np.float32), soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
+        seam = inside[t] & (cv2.dilate(added[t].astype(np.uint8), disc(1)) > 0)  # so that no gap opens when enlarged
+        sure = cv2.resize((added[t] | seam).astype(np.float32), soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
         out[t] = np.maximum(out[t], 0.9 * sure)
         gained[t] = np.count_nonzero(added[t])
     return out, gained
@@ -111,15 +113,15 @@ def _pieces(odds: np.ndarray, inside: np.ndarray, away: np.ndarray, known: np.nd
     free = (known & ~inside).astype(np.float32)
     steady = cv2.GaussianBlur(odds * free, (0, 0), 1.0) / (cv2.GaussianBlur(free, (0, 0), 1.0) + 1e-3)
     wanted = ((steady > 0) & (free > 0) & (away < REACH_PX)).astype(np.uint8)
-    thick = cv2.dilate(cv2.morphologyEx(wanted, cv2.MORPH_OPEN, _disc(2)), _disc(1)) & wanted
+    thick = cv2.dilate(cv2.morphologyEx(wanted, cv2.MORPH_OPEN, disc(2)), disc(1)) & wanted
     count, labels, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
     touching = np.bincount(labels[away < 3.0], minlength=count) > 0
     areas = stats[:, cv2.CC_STAT_AREA]
     kept = touching & (areas >= LEAST_PX) & (areas <= LARGEST_SHARE * np.count_nonzero(inside))
     kept[0] = False
     new = kept[labels]
-    closed = cv2.morphologyEx((new | inside).astype(np.uint8), cv2.MORPH_CLOSE, _disc(1)) > 0
-    return closed & ~inside & (cv2.dilate(new.astype(np.uint8), _disc(2)) > 0)
+    closed = cv2.morphologyEx((new | inside).astype(np.uint8), cv2.MORPH_CLOSE, disc(1)) > 0
+    return closed & ~inside & (cv2.dilate(new.astype(np.uint8), disc(2)) > 0)
 
 
 def told_right(looks: np.ndarray, added: np.ndarray, background: np.ndarray) -> float:
@@ -177,7 +179,3 @@ def _window(mask: np.ndarray) -> tuple[slice, slice]:
     """The part of a frame that holds the whole mask, and at least a pixel."""
     x0, y0, x1, y1 = (int(v) for v in mask_box(mask))
     return slice(y0, max(y1, y0 + 1)), slice(x0, max(x1, x0 + 1))
-
-
-def _disc(radius: int) -> np.ndarray:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

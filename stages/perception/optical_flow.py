@@ -21,6 +21,9 @@ PRESETS = {
 }
 
 
+_LEAST_SIDE_PX, _LONGEST_ASPECT = 24, 4
+
+
 class Matcher:
     """DIS optical flow (Kroeger et al. 2016); `preset` is ultrafast, fast, medium or fine.
 
@@ -35,7 +38,12 @@ class Matcher:
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Flow (H, W, 2) from `first` to `second`, (H, W) uint8 each."""
-        return np.asarray(self._dis.calc(first, second, None))  # type: ignore[arg-type, call-overload]
+        height, width = first.shape
+        least = max(_LEAST_SIDE_PX, -(-max(height, width) // _LONGEST_ASPECT))
+        if min(height, width) < least:  # the library crashes on narrow pictures
+            sides = 0, max(0, least - height), 0, max(0, least - width)
+            first, second = (cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE) for image in (first, second))
+        return np.asarray(self._dis.calc(first, second, None))[:height, :width]  # type: ignore[arg-type, call-overload]
 
 
 def pixel_grid(height: int, width: int) -> np.ndarray:

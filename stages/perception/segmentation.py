@@ -29,7 +29,7 @@ from stages.perception.missing_pieces import with_missing_pieces
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.outline import settle_outline
 from stages.perception.refining import RefiningNetwork, refine
-from stages.perception.temporal import flow_median, main_component, resize_maps, signed_distance
+from stages.perception.temporal import disc, flow_median, main_component, resize_maps, signed_distance
 
 WORK_SIDE_PX = 256
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
@@ -61,7 +61,7 @@ class Segmentation:
     prior: str = ""  # the category whose network had a say
     refined: bool = False  # whether a network went over the rough mask
     found_again: int = 0  # frames in which colours and motion had lost the object
-    mended: int = 0  # frames that gained a piece the background had hidden
+    with_pieces: int = 0  # frames that gained a piece that looks like the background
 
 
 @dataclass(frozen=True)
@@ -321,11 +321,11 @@ def _nearness(maps: np.ndarray, sigma_px: float) -> np.ndarray:
 
 def _rim(masks: np.ndarray, rim_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Core (eroded by the rim), outside (beyond the rim) and close surroundings of boolean (T, h, w) masks."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim_px + 1, 2 * rim_px + 1))
+    rim = disc(rim_px)
     wide = np.ones((41, 41), np.uint8)
     eight = masks.astype(np.uint8)
-    core = np.stack([cv2.erode(m, disc) for m in eight])
-    off = np.stack([cv2.dilate(m, disc) for m in eight]) == 0
+    core = np.stack([cv2.erode(m, rim) for m in eight])
+    off = np.stack([cv2.dilate(m, rim) for m in eight]) == 0
     close = np.stack([cv2.dilate(m, wide) for m in eight]) > 0
     return core.astype(np.float32), off, close
 

@@ -137,3 +137,8 @@ def signed_distance(mask: np.ndarray) -> np.ndarray:
     eight = mask.astype(np.uint8)
     inside = cv2.distanceTransform(eight, cv2.DIST_L2, 3)
     return np.where(mask, inside, -cv2.distanceTransform(1 - eight, cv2.DIST_L2, 3)).astype(np.float32)
+
+
+def disc(radius: int) -> np.ndarray:
+    """(2 r + 1, 2 r + 1) uint8 structuring element."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -67,13 +67,13 @@ def test_a_foot_of_the_colour_of_the_ground_is_added() -> None:
 
 def test_the_ground_alone_adds_nothing() -> None:
     scene = _Scene(foot=False)
-    _, wrong = scene.shares(scene.mended())
-    right, _ = scene.shares(scene.mended())
+    right, wrong = scene.shares(scene.mended())
     assert right + wrong < 0.02
 
 
 def test_a_shadow_is_none_of_the_object() -> None:
-    right, wrong = _Scene(foot=False, shadow=True).shares(_Scene(foot=False, shadow=True).mended())
+    scene = _Scene(foot=False, shadow=True)
+    right, wrong = scene.shares(scene.mended())
     assert right + wrong < 0.05
 
 
@@ -132,6 +132,21 @@ def test_frames_are_registered_by_the_ground() -> None:
         assert np.median(error) < (0.8 if abs(t - anchor) < 15 else 2.0)
         seen += 1
     assert seen > COUNT
+
+
+def test_what_enters_the_picture_is_outside_the_anchor() -> None:
+    ground = _ground(np.random.default_rng(5), 1.0)
+    frames = [
+        np.repeat(ground[10 : 10 + HEIGHT, 3 * t : 3 * t + WIDTH, None], 3, 2).clip(0, 255).astype(np.uint8)
+        for t in range(12)
+    ]
+    carrier = Carrier(frames)
+    masks = np.zeros((12, HEIGHT, WIDTH), np.uint8)
+    for t, anchor, at in registered(frames, masks, carrier.to_next, carrier.to_previous):
+        beyond = 3 * (t - anchor)  # columns that the anchor does not show
+        entered = at[..., 0][:, -beyond:] if beyond > 0 else at[..., 0][:, :-beyond]
+        outside = (entered > WIDTH - 1) | (entered < 0)
+        assert outside.mean() > 0.8
 
 
 def test_evidence_is_for_the_foot_and_against_the_ground() -> None:

@@ -120,3 +120,13 @@ def test_enlarged_flow_keeps_its_meaning() -> None:
     np.testing.assert_allclose(large[5, 5], [4.0, 2.0])
     ramp = np.tile(np.arange(40, dtype=np.float32), (16, 1))
     np.testing.assert_allclose(sample(ramp, large)[8, 10], 14.0, atol=0.05)
+
+
+@pytest.mark.parametrize("shape", [(16, 256), (20, 128), (256, 20), (9, 9), (1, 64)])
+@pytest.mark.parametrize("preset", ["ultrafast", "fast", "medium"])
+def test_narrow_pictures_have_a_flow(shape: tuple[int, int], preset: str) -> None:
+    """The library itself crashes on some of these, and takes the process with it."""
+    picture = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    still = Matcher(preset)(picture, picture)
+    assert still.shape == (*shape, 2)
+    assert np.abs(still).max() < 1.0
