@@ -18,6 +18,7 @@ from stages.registration.answer import Answer, Provider, Subject, ViewBelief
 from stages.registration.combine import combine
 from stages.registration.cues import CROP_MARGIN, Cues, crop_embedding, crop_frame, principal_directions
 from stages.registration.given import PoseDocumentError, parse_intrinsics, parse_transforms, scale_intrinsics
+from stages.registration.ground import ground_elevations, plane_views
 from stages.registration.placing import (
     default_intrinsics,
     depth_from_size,
@@ -101,6 +102,8 @@ def poses(
         for n in clips:
             subject = _subject(n, clips[n], masks[n], flow[n], features[n], basis, settings, tracks.get(n), run)
             subjects.append(subject if network is None else replace(subject, view=_view(clips[n], masks[n], network)))
+        if network is not None:
+            subjects = _on_ground(subjects, clips, settings, run)
         answers, tried = _ask(subjects, asked, settings, run)
         tracks |= {s.name: _track(s, answers[s.name]) for s in subjects if s.name in answers}
     for name, clip in clips.items():
@@ -193,6 +196,30 @@ def _view(clip: formats.Clip, masks: Folder, network: OwnNetwork, chunk: int = 3
     return ViewBelief(
         azimuth, elevation, roll, -np.radians(AZIMUTH_DEG), np.radians(ELEVATION_DEG), np.radians(ROLL_DEG)
     )
+
+
+def _on_ground(
+    subjects: list[Subject], clips: dict[str, formats.Clip], settings: PosesSettings, run: Run
+) -> list[Subject]:
+    """The subjects, where the ground shows it with the elevation from which they are seen."""
+    views, focals = [], []
+    for done, subject in enumerate(subjects):
+        run.tick(done, len(subjects), label=f"looking at the ground of {subject.name}")
+        clip = clips[subject.name]
+        views.append(plane_views(len(clip), subject.frame) if subject.frame is not None else [])
+        focals.append((settings.focal_px or clip.focal_hint_px or 0.0) / max(clip.width, clip.height))
+    known = float(np.median(focals)) if min(focals) > 0 else None
+    elevations, focal = ground_elevations(views, [len(s.cues) for s in subjects], known)
+    run.metric("ground_clips", sum(e is not None for e in elevations))
+    run.metric("ground_focal", round(focal, 3))
+    out = []
+    for subject, elevation in zip(subjects, elevations, strict=True):
+        if elevation is not None and subject.view is not None:
+            clip = clips[subject.name]
+            below = (subject.cues.centre_px[:, 1] - clip.height / 2) / (focal * max(clip.width, clip.height))
+            subject = replace(subject, view=replace(subject.view, ground_elevation=elevation + np.arctan(below)))
+        out.append(subject)
+    return out
 
 
 def _subject(

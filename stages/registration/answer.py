@@ -25,6 +25,7 @@ class ViewBelief:
     azimuth_bins: np.ndarray
     elevation_bins: np.ndarray
     roll_bins: np.ndarray
+    ground_elevation: np.ndarray | None = None  # (T,) radians, from which the ground around the object is seen
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Root poses by a network that knows the category: its views of single frames, tied together in time.
 
 A frame alone is often mistaken for its mirror image or its back; a clip seldom is. The network's probabilities, the
-turn that the flow suggests and a smooth path are one hidden Markov model.
+turn that the flow suggests and a smooth path are one hidden Markov model. How far from above the object is seen, the
+network hardly knows; where the ground tells (`ground`), it is asked instead.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ def view_path(subject: Subject, view: ViewBelief) -> tuple[np.ndarray, np.ndarra
     raised = with_habit(view.elevation, view.elevation_bins, USUAL_ELEVATION, USUAL_ELEVATION_SPREAD)
     turned = with_habit(view.roll, view.roll_bins, 0.0, USUAL_ROLL_SPREAD)
     tilt = [_steady(say * p, b) for p, b in ((raised, view.elevation_bins), (turned, view.roll_bins))]
+    if view.ground_elevation is not None:  # known to a degree or two; the network's error is ten
+        tilt[0] = view.ground_elevation
     return smooth(np.unwrap(np.angle(mean)), 2.0), smooth(tilt[0], 2.0), smooth(tilt[1], 2.0), np.abs(mean)
 
 
