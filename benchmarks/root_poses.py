@@ -30,7 +30,7 @@ from stages.registration.placing import default_intrinsics, ray_rotation, view_r
 log = logging.getLogger(__name__)
 RUNGS = {
     "frame": "network, each frame alone",
-    "seen": "network, flow and time (the stage)",
+    "seen": "network, flow, time and ground (the stage)",
     "pnp": "PnP + RANSAC on the embedding",
     "search": "search by silhouettes and colours",
     "colmap": "COLMAP on the masked frames",
@@ -54,6 +54,8 @@ def read_workspace(root: Path) -> tuple[list[Subject], dict[str, Clip], dict[str
         if network is not None:
             subject = replace(subject, view=stage._view(clips[name], parts["masks"], network))
         subjects.append(subject)
+    if network is not None:
+        subjects = stage._on_ground(subjects, clips, settings, run)
     return subjects, clips, features, network.category if isinstance(network, OwnNetwork) else "other"
 
 
