@@ -21,6 +21,8 @@ STEPS = (8, 14, 20)
 EVERY = 3
 LEAST_POINTS = 30
 LEAST_VIEWS = 8
+LEAST_SHIFT = 0.05
+"""Of the camera between two views, over its distance from the plane; a camera that only turns sees no plane."""
 FOCALS = np.geomspace(0.7, 2.2, 25)
 """Focal lengths tried, over the longer side."""
 MOST_SPREAD, MOST_ROLL = np.radians(3.0), np.radians(5.0)
@@ -131,9 +133,11 @@ def _tilts(views: list[PlaneView], focal: float) -> np.ndarray:
     camera = np.diag([focal, focal, 1.0])
     out = []
     for view in views:
-        _, _, _, normals = cv2.decomposeHomographyMat(view.homography, camera)
+        _, _, shifts, normals = cv2.decomposeHomographyMat(view.homography, camera)
         readings = []
-        for normal in normals:
+        for shift, normal in zip(shifts, normals, strict=True):
+            if np.linalg.norm(shift) < LEAST_SHIFT:
+                continue
             x, y, z = normal[:, 0] if normal[1, 0] < 0 else -normal[:, 0]
             elevation, roll = np.arcsin(np.clip(-z, -1, 1)), np.arctan2(x, -y)
             if _LOWEST < elevation < _HIGHEST and abs(roll) < _LARGEST_ROLL:

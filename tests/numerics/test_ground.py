@@ -68,8 +68,13 @@ def test_what_is_no_plane_tells_nothing() -> None:
     rng = np.random.default_rng(1)
     wild = [PlaneView(t, np.eye(3) + 0.1 * rng.normal(size=(3, 3))) for t in range(0, COUNT, 2)]
     assert ground_elevations([wild], [COUNT])[0] == [None]
-    still = [PlaneView(t, np.eye(3)) for t in range(0, COUNT, 2)]  # nor does a camera that stands still
-    assert ground_elevations([still], [COUNT])[0] == [None]
+    still = [PlaneView(t, np.eye(3)) for t in range(0, COUNT, 2)]  # nor does a camera that stands still, or only turns
+    camera = np.diag([FOCAL, FOCAL, 1.0])
+    turns = [cv2.Rodrigues(np.array([0.0, 0.01 * t, 0.0]))[0] for t in range(COUNT)]
+    turning = [PlaneView(t, camera @ turns[t] @ np.linalg.inv(camera)) for t in range(0, COUNT, 2)]
+    for views in (still, turning):
+        assert ground_elevations([views], [COUNT])[0] == [None]
+        assert ground_elevations([views], [COUNT], FOCAL)[0] == [None]
     assert ground_elevations([[], _views(_path(0.3))[:4]], [COUNT, COUNT]) == ([None, None], 0.0)
 
 
