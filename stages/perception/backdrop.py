@@ -20,7 +20,7 @@ from stages.perception.background import background_flow, polynomial_basis
 from stages.perception.optical_flow import Matcher, compose, pixel_grid
 from stages.perception.temporal import disc, enlarge, mask_box
 
-ANCHOR_STEP = 8
+ANCHOR_STEP = 12
 """Every so many frames one is compared with those around it."""
 ANCHOR_SPAN, ANCHOR_NEAR = 36, 3
 """Frames at most, and at least, between the two compared."""
