@@ -201,12 +201,15 @@ def _view(clip: formats.Clip, masks: Folder, network: OwnNetwork, chunk: int = 3
 def _on_ground(
     subjects: list[Subject], clips: dict[str, formats.Clip], settings: PosesSettings, run: Run
 ) -> list[Subject]:
-    """The subjects, where the ground shows it with the elevation from which they are seen."""
+    """The subjects; those whose root poses are asked for with the elevation that the ground tells, where it does."""
     views, focals = [], []
     for done, subject in enumerate(subjects):
         run.tick(done, len(subjects), label=f"looking at the ground of {subject.name}")
+        if run.stop_requested:
+            run.interrupt()
         clip = clips[subject.name]
-        views.append(plane_views(len(clip), subject.frame) if subject.frame is not None else [])
+        frame = subject.frame if subject.rotation is None else None
+        views.append([] if frame is None else plane_views(len(clip), frame))
         focals.append((settings.focal_px or clip.focal_hint_px or 0.0) / max(clip.width, clip.height))
     known = float(np.median(focals)) if min(focals) > 0 else None
     elevations, focal = ground_elevations(views, [len(s.cues) for s in subjects], known)

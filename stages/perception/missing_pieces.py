@@ -23,16 +23,15 @@ FIRST_BAR, BAR = 0.5, 1.0
 LOOKS_SHARE, LOOKS_LIMIT = 0.3, 3.0
 """How much the classifier's log-odds count (raised by 1, what its diet of one third object takes), and up to where:
 alone they pass the bar only where they are very sure."""
-LEAST_ALIKE = 0.88
+LEAST_ALIKE = 0.9
 """Share of both the pieces and the background that must be told right by looks, or else nothing was found. Shoes on
-five kinds of ground and paws in grass give 0.90 and more, furniture at many depths 0.84 and less."""
+five kinds of ground and paws in grass give 0.92 and more, furniture at many depths 0.88 and less."""
 LEAST_PX = 12
 LARGEST_SHARE = 0.5
 """A piece larger than this share of the mask is none: something else came by."""
 LEAST_FRAMES = 8
 _CARRIED_FRAMES, _CARRIED_SHARE = 3, 0.7
 _LEAST_WEIGHT = 0.2
-_ROUNDS = 1  # a second gains 0.001 at most, for a fifth of the time
 _UNSEEN = -99.0
 _TAUGHT_REACH_PX, _TAUGHT_PER_FRAME, _TAUGHT_FRAMES = 40.0, 1500, 48
 _STEPS, _PIXELS = 240, 2048
@@ -62,13 +61,11 @@ def with_missing_pieces(
     away = np.stack([-signed_distance(mask) for mask in inside])
     evidence, known = found.evidence + told, found.weight > _LEAST_WEIGHT
     added = pieces(evidence - FIRST_BAR, inside, away, known)
-    for turn in range(_ROUNDS):
-        looks = _looks(work, evidence, inside, added, away, known, seed + 30 + turn)
-        if looks is None or told_right(looks, added, known & ~added & (evidence < -FIRST_BAR)) < LEAST_ALIKE:
-            return soft, gained
-        near = ~inside & (away < REACH_PX)
-        both = evidence + LOOKS_SHARE * (np.minimum(looks, LOOKS_LIMIT) + 1.0)
-        added = pieces(both - BAR, inside, away, near)
+    looks = _looks(work, evidence, inside, added, away, known, seed + 30)
+    if looks is None or told_right(looks, added, known & ~added & (evidence < -FIRST_BAR)) < LEAST_ALIKE:
+        return soft, gained
+    both = evidence + LOOKS_SHARE * (np.minimum(looks, LOOKS_LIMIT) + 1.0)
+    added = pieces(both - BAR, inside, away, ~inside & (away < REACH_PX))
     out = soft.astype(np.float32, copy=True)
     for t in np.flatnonzero(added.reshape(len(added), -1).any(axis=1)):
         seam = inside[t] & (cv2.dilate(added[t].astype(np.uint8), disc(1)) > 0)  # so that no gap opens when enlarged

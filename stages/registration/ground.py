@@ -109,7 +109,8 @@ def ground_elevations(
 ) -> tuple[list[np.ndarray | None], float]:
     """The camera's elevation (T,) radians above the ground in each clip, None where it does not show; the focal length.
 
-    Positive looks down. `focal`, over the longer side, is known or None; the one found is 0 where nothing tells it.
+    Positive looks down. `focal`, over the longer side, is known or None; it comes back as 0 where no clip's ground is
+    believed.
     """
     seen = [views for views in clips if len(views) >= LEAST_VIEWS]
     if not seen:
@@ -125,7 +126,7 @@ def ground_elevations(
         tilts = _tilts(views, focal)
         spread, roll = _judged(tilts)
         out.append(_path(tilts, count) if spread < MOST_SPREAD and roll < MOST_ROLL else None)
-    return out, focal
+    return out, focal if any(path is not None for path in out) else 0.0
 
 
 def _tilts(views: list[PlaneView], focal: float) -> np.ndarray:
@@ -151,13 +152,15 @@ def _judged(tilts: np.ndarray) -> tuple[float, float]:
     """Median distance of elevations from their neighbours' median, and median size of roll; both large for too few."""
     if len(tilts) < LEAST_VIEWS:
         return float(2 * MOST_SPREAD), float(2 * MOST_ROLL)
-    usual = [np.median(tilts[np.abs(tilts[:, 0] - t) <= _NEIGHBOURS, 1]) for t in tilts[:, 0]]
-    return float(np.median(np.abs(tilts[:, 1] - usual))), float(np.median(np.abs(tilts[:, 2])))
+    return float(np.median(np.abs(tilts[:, 1] - _usual(tilts)))), float(np.median(np.abs(tilts[:, 2])))
+
+
+def _usual(tilts: np.ndarray) -> np.ndarray:
+    """(N,) median elevation of each view and its neighbours in time."""
+    return np.array([np.median(tilts[np.abs(tilts[:, 0] - t) <= _NEIGHBOURS, 1]) for t in tilts[:, 0]])
 
 
 def _path(tilts: np.ndarray, count: int) -> np.ndarray:
     """Elevation (T,) of every frame: local medians of the views', blurred."""
-    frames = np.arange(count)
-    usual = np.array([np.median(tilts[np.abs(tilts[:, 0] - t) <= _NEIGHBOURS, 1]) for t in tilts[:, 0]])
-    weight = np.exp(-0.5 * ((frames[:, None] - tilts[None, :, 0]) / _REACH) ** 2) + 1e-9
-    return np.asarray(weight @ usual / weight.sum(axis=1))
+    weight = np.exp(-0.5 * ((np.arange(count)[:, None] - tilts[None, :, 0]) / _REACH) ** 2) + 1e-9
+    return np.asarray(weight @ _usual(tilts) / weight.sum(axis=1))
