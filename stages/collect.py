@@ -93,5 +93,5 @@ def _video_facts(name: str, clip: formats.Clip, track: formats.PoseTrack) -> Vid
         focal_px=(float(k[0, 0]), float(k[1, 1])),
         principal_px=(float(k[0, 2]), float(k[1, 2])),
         root_given=set(track.provider) == {"given"},
-        root_jitter_rad=track.jitter_rad,
+        root_wave_rad=track.wave_rad,
     )

@@ -276,7 +276,8 @@ class PoseTrack:
     object_to_camera: np.ndarray  # (T, 4, 4) float64, rigid
     confidence: np.ndarray  # (T,) float in 0..1
     provider: list[str]  # who spoke, a frame
-    jitter_rad: float = 0.0  # root mean square turn that was taken out of given poses from frame to frame
+    wave_rad: tuple[float, float, float] | None = None
+    """By how much the rotations may be off about object space's axes, slowly: root mean square; None if unknown."""
 
 
 def write_poses(path: Path, track: PoseTrack, clip: Clip) -> None:
@@ -290,7 +291,7 @@ def write_poses(path: Path, track: PoseTrack, clip: Clip) -> None:
             "time_s": [float(t) for t in clip.time_s],
             "confidence": [round(float(c), 4) for c in track.confidence],
             "provider": track.provider,
-            "jitter_rad": float(track.jitter_rad),
+            "wave_rad": None if track.wave_rad is None else [float(w) for w in track.wave_rad],
         },
     )
 
@@ -305,7 +306,7 @@ def read_poses(path: Path) -> PoseTrack:
             object_to_camera=poses.reshape(-1, 4, 4),
             confidence=np.array(info.get("confidence", [1.0] * len(poses)), np.float64),
             provider=list(info.get("provider", ["given"] * len(poses))),
-            jitter_rad=float(info.get("jitter_rad", 0.0)),
+            wave_rad=(float(w[0]), float(w[1]), float(w[2])) if (w := info.get("wave_rad")) else None,
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path.name}: {error!r} missing or malformed") from error

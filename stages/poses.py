@@ -31,7 +31,7 @@ from stages.registration.placing import (
 from stages.registration.search import search
 from stages.registration.seen import seen
 from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
-from stages.registration.steadying import jitter, steady
+from stages.registration.steadying import steady, wave_left
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
@@ -150,7 +150,9 @@ def _steadied(
     run.metric("steadied_turns_s", around_s)
     run.metric("steadied_places_s", placed_s)
     return {
-        name: replace(track, object_to_camera=made, jitter_rad=jitter(track.object_to_camera, made))
+        name: replace(
+            track, object_to_camera=made, wave_rad=wave_left(track.object_to_camera, made, clips[name].time_s)
+        )
         for (name, track), made in zip(tracks.items(), matrices, strict=True)
     }
 
@@ -305,7 +307,11 @@ def _track(subject: Subject, answer: Answer) -> formats.PoseTrack:
     translation = place(answer.origin_px, depth, subject.intrinsics)
     confidence = np.where(cues.known, answer.confidence, 0.0)
     return formats.PoseTrack(
-        subject.intrinsics, transforms(rotation, translation), confidence, [answer.provider] * len(cues)
+        subject.intrinsics,
+        transforms(rotation, translation),
+        confidence,
+        [answer.provider] * len(cues),
+        answer.wave_rad,
     )
 
 

@@ -4,9 +4,9 @@ Pictures only see ``G(t) J_b(t)``; a rigid motion can move from the root pose G 
 rendered changes. What the fit leaves there is whatever the first root poses had wrong, so it is settled afterwards:
 object space is the frame in which the bulk of the surface (a trunk, not limbs) is nearly at rest.
 
-Where root poses were given and jittered, their object space is meant, but what smoothing leaves of the jitter is a slow
-wave in them, which the bones make up for: the trunk appears to sway. Of what it sways slowly, as much goes to the root
-as such a wave may explain (a Wiener filter with one weight a clip).
+A trunk sways by itself, too: a dancer's turns to and fro under her head. Where it is known how far root poses may be
+off (those that somebody gave and that jittered, those of a network), a sway is divided: of what the trunk does about an
+axis, as much goes to the root as its error about that axis may explain (a Wiener filter, one matrix a clip).
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from torch import Tensor
 
 from stages.geometry.rotations import invert_rigid, matrix_to_quaternion, quaternion_to_matrix, rigid
 from stages.model.banmo import Banmo
-
-SLOW_S = 0.75
-"""What a trunk does slower than this (seconds, a Gaussian's width) may be the given root poses' doing."""
+from stages.registration.steadying import SLOW_S
 
 SWAY_SOFTNESS = 0.12
 """As `softness` below, where a trunk that does sway must not be told from one that seems to: more of the body votes."""
@@ -38,6 +36,7 @@ def settle(
     """Set ``model.gauge`` so that the surface moves least in object space; root poses that are held stay as they are.
 
     Of those that somebody gave and that may move (``root_given``) object space is meant: they lose a slow wave at most.
+    Of estimated ones whose error is known (``root_wave_rad``) places settle, and turns as far as the error goes.
 
     `softness` (units) is the distance from which a point counts as moving limb. What a trunk does faster than about
     `steady_s` (seconds, a Gaussian's width) stays with the bones: a hand-held camera and a body's heading are slower.
@@ -58,18 +57,18 @@ def settle(
     motion = torch.eye(4).repeat(len(whole), 1, 1)
     if free.any():
         motion = rigid_parts(posed, free, softness, rounds)
-        settled = whole @ invert_rigid(motion)
-        for i, video in enumerate(model.videos):
-            mine = slice(model.starts[i], model.starts[i + 1])
-            if free[mine].all():
-                settled[mine] = steadied(settled[mine], np.asarray(video.time_s), steady_s)
-        motion = torch.where(free[:, None, None], invert_rigid(settled) @ whole, motion)
+    middle = posed.median(0).values.mean(0)
     for i, video in enumerate(model.videos):
-        if video.root_given and video.root_jitter_rad > 0 and may[i]:
-            mine = slice(model.starts[i], model.starts[i + 1])
+        mine, time_s, wave = slice(model.starts[i], model.starts[i + 1]), np.asarray(video.time_s), video.root_wave_rad
+        if free[mine].all():
+            if wave is not None:
+                motion[mine] = divided(motion[mine], middle, time_s, wave)
+            steady = steadied(whole[mine] @ invert_rigid(motion[mine]), time_s, steady_s)
+            motion[mine] = invert_rigid(steady) @ whole[mine]
+        elif video.root_given and wave is not None and may[i]:
             free[mine] = True
             rest = rigid_parts(posed[mine], torch.ones(mine.stop - mine.start, dtype=torch.bool), SWAY_SOFTNESS, rounds)
-            motion[mine] = unswayed(rest, np.asarray(video.time_s), video.root_jitter_rad)
+            motion[mine] = rigid(unswayed(rest, time_s, wave, SLOW_S), torch.zeros(len(rest), 3))
     if not free.any():
         return 0.0
     model.gauge.copy_(motion.to(model.gauge) @ model.gauge)
@@ -77,22 +76,33 @@ def settle(
     return float(((trace - 1) / 2).clamp(-1, 1).acos().mean())
 
 
-def unswayed(rest: Tensor, time_s: np.ndarray, jitter_rad: float, width_s: float = SLOW_S) -> Tensor:
-    """Turns about the origin of object space (T, 4, 4) that take a trunk's slow sway off it, if it is not its own.
+def divided(rest: Tensor, middle: Tensor, time_s: np.ndarray, wave_rad: tuple[float, float, float]) -> Tensor:
+    """Motions (T, 4, 4) that bring `middle` (3,) to rest as `rest` (T, 4, 4) does, but leave a trunk its own turns.
 
-    `rest` (T, 4, 4) brings the trunk from object space to rest. What turns of `jitter_rad` a frame leave after
-    smoothing over `width_s` (seconds, a Gaussian's) is known; what the trunk itself does is not, and is taken to be
-    all that is seen. So of a sway that jitter explains alone a half goes, of a smaller one more, of a larger one less.
+    What all frames share of the turn stays, too: it is no sway.
     """
-    spacing_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else width_s
+    usual = torch.from_numpy(Rotation.from_matrix(rest[:, :3, :3].double().numpy()).mean().as_matrix()).to(rest)
+    turn = usual @ unswayed(rest, time_s, wave_rad)
+    before = middle @ invert_rigid(rest)[:, :3, :3].transpose(1, 2) + invert_rigid(rest)[:, :3, 3]
+    return rigid(turn, middle - (turn @ before[..., None]).squeeze(-1))
+
+
+def unswayed(rest: Tensor, time_s: np.ndarray, wave_rad: tuple[float, float, float], slow_s: float = 0.0) -> Tensor:
+    """Turns (T, 3, 3) of object space that take a trunk's sway off it, as far as it is not its own.
+
+    `rest` (T, 4, 4) brings the trunk from object space to rest; only what it does slower than `slow_s` (seconds, a
+    Gaussian's width) is asked about. The root's error is known, `wave_rad` about each axis; what the trunk itself does
+    is not, and is taken to be all that is seen. So about each axis, of a sway that the error explains alone a half
+    goes, of a smaller one more, of a larger one less.
+    """
     turns = Rotation.from_matrix(rest[:, :3, :3].double().numpy())
-    middle = turns.mean()
-    slow = gaussian_filter1d((turns * middle.inv()).as_rotvec(), width_s / max(spacing_s, 1e-6), axis=0, mode="nearest")
-    seen = float(np.square(slow).sum(1).mean())
-    left = jitter_rad**2 * spacing_s / (2 * np.sqrt(np.pi) * width_s)
-    share = left / max(left + seen, 1e-12)
-    taken = (middle.inv() * Rotation.from_rotvec(share * slow) * middle).as_matrix()
-    return rigid(torch.from_numpy(taken), torch.zeros(len(rest), 3, dtype=torch.float64)).to(rest.dtype)
+    sway = (turns.mean().inv() * turns).as_rotvec()
+    if slow_s:
+        spacing_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else slow_s
+        sway = gaussian_filter1d(sway, slow_s / max(spacing_s, 1e-6), axis=0, mode="nearest")
+    wave = np.diag(np.square(wave_rad)) + 1e-12 * np.eye(3)
+    share = wave @ np.linalg.inv(wave + sway.T @ sway / len(sway))
+    return torch.from_numpy(Rotation.from_rotvec(sway @ share.T).as_matrix()).to(rest)
 
 
 def rigid_parts(posed: Tensor, free: Tensor, softness: float, rounds: int) -> Tensor:

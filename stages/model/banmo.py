@@ -42,8 +42,9 @@ class VideoFacts:
     principal_px: tuple[float, float]
     root_given: bool = False
     """Somebody gave the root poses: they may move, but their object space is meant."""
-    root_jitter_rad: float = 0.0
-    """Root mean square turn (radians) from frame to frame that was taken out of those before the fit."""
+    root_wave_rad: tuple[float, float, float] | None = None
+    """By how much root poses may be turned wrongly about each axis of object space, slowly, once they are steady: root
+    mean square, radians. None where nobody knows."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +243,7 @@ class Banmo(nn.Module):
                 focal_px=tuple(v["focal_px"]),
                 principal_px=tuple(v["principal_px"]),
                 root_given=bool(v.get("root_given", False)),
-                root_jitter_rad=float(v.get("root_jitter_rad", 0.0)),
+                root_wave_rad=(float(w[0]), float(w[1]), float(w[2])) if (w := v.get("root_wave_rad")) else None,
             )
             for v in description["videos"]
         ]

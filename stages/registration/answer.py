@@ -59,6 +59,8 @@ class Answer:
     confidence: np.ndarray  # (T,) in 0..1
     trust: float  # 0..1: how likely the clip as a whole is right within 45 degrees or so
     score: dict[str, Any] = field(default_factory=dict)  # figures for poses.json
+    wave_rad: tuple[float, float, float] | None = None
+    """How far rotations that are right as a whole are off about each axis of object space, usually; None if unknown."""
 
 
 Tell = Callable[[int, int, str], None]

@@ -30,6 +30,8 @@ USUAL_ROLL_SPREAD = np.radians(5.0)
 """People hold a camera level and a little above what stands on the ground, mostly."""
 TILT_SIGMA = np.radians(1.0)
 """Change of elevation and roll from frame to frame, radians."""
+WAVE_AROUND, WAVE_ON_GROUND, WAVE_ASKEW = np.radians(5.0), np.radians(2.0), np.radians(8.0)
+"""How far a steady path is off: around the object; askew, where the ground tells the elevation; where it does not."""
 AGREEMENT = np.pi / 4
 CHANCE = 0.25
 """What single frames say, on average, for views within AGREEMENT of a path that has nothing to do with them."""
@@ -54,7 +56,9 @@ def seen(subjects: list[Subject], seed: int, tell: Tell) -> dict[str, Answer]:
         trust, agreed = _trust(subject, view, path[0])
         confidence = trust * path[3] * np.where(subject.cues.cut, 0.5, 1.0)
         figures = {"agreed": round(agreed, 3)}
-        answers[subject.name] = Answer("network", rotation, extent, origin_px, confidence, trust, figures)
+        askew = float(WAVE_ASKEW if view.ground_elevation is None else WAVE_ON_GROUND)
+        wave = askew, float(WAVE_AROUND), askew
+        answers[subject.name] = Answer("network", rotation, extent, origin_px, confidence, trust, figures, wave)
     return answers
 
 

@@ -16,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9, 1.4, 2.2, 5.0)
 """Reaches that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
+SLOW_S = 0.75
+"""What jitter leaves in steady poses is slower than this (seconds, a Gaussian's width): a wave."""
 _FEWEST = 8
 _WORTH = 0.95  # share of the closest neighbours' error that a farther reach has to get below
 _NOTHING = 1e-4  # radians or units: no jitter at all
@@ -52,10 +54,17 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> tuple[list[np
     return out, (axis_s, around_s), placed_s
 
 
-def jitter(given: np.ndarray, made: np.ndarray) -> float:
-    """Root mean square angle (radians) between rotations of (T, 4, 4) poses and what `steady` made of them."""
+def wave_left(given: np.ndarray, made: np.ndarray, time_s: np.ndarray) -> tuple[float, float, float]:
+    """Root mean square turn (radians) about each axis that independent errors leave in rotations made steady.
+
+    `given` (T, 4, 4) are the poses and `made` what `steady` made of them; of what was taken out, white noise, this much
+    is slower than SLOW_S.
+    """
     turns = Rotation.from_matrix(given[:, :3, :3]).inv() * Rotation.from_matrix(made[:, :3, :3])
-    return float(np.sqrt(np.mean(turns.magnitude() ** 2)))
+    spacing_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else SLOW_S
+    slow = spacing_s / (2 * np.sqrt(np.pi) * SLOW_S)
+    wave = float(np.sqrt(np.mean(turns.magnitude() ** 2) * slow / 3))
+    return wave, wave, wave
 
 
 def main_axis(turns: list[np.ndarray]) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from stages.fitting.gauge import align, rigid_parts, settle, steadied, unswayed
+from stages.fitting.gauge import align, divided, rigid_parts, settle, steadied, unswayed
 from stages.geometry.rotations import geodesic_angle, invert_rigid, rigid, so3_exp
 from stages.model.banmo import Architecture, Banmo, VideoFacts
 from stages.model.skeleton import Bones
@@ -126,26 +126,57 @@ def _sway(rest: torch.Tensor) -> float:
     return float(np.sqrt(np.mean((turns * turns.mean().inv()).magnitude() ** 2)))
 
 
-def test_a_slow_sway_that_jitter_explains_goes_to_the_root_and_no_other() -> None:
+def test_a_slow_sway_that_the_roots_error_explains_goes_to_the_root_and_no_other() -> None:
     rest, time = _swaying(0.04, 8.0)
+    still = torch.zeros(240, 3)
 
-    def left(rest: torch.Tensor, jitter_rad: float) -> float:
-        return _sway(rest @ invert_rigid(unswayed(rest, time, jitter_rad))) / _sway(rest)
+    def left(rest: torch.Tensor, wave_rad: float, slow_s: float = 0.75) -> float:
+        turn = rigid(unswayed(rest, time, (wave_rad, wave_rad, wave_rad), slow_s), still)
+        return _sway(rest @ invert_rigid(turn)) / _sway(rest)
 
-    assert left(rest, 1.0) < 0.35  # what so strong a jitter leaves is more than is seen
-    assert 0.35 < left(rest, 0.25) < 0.8
-    assert left(rest, 0.02) > 0.98
+    assert left(rest, 0.08) < 0.35  # more than is seen
+    assert 0.4 < left(rest, 0.025) < 0.7
+    assert left(rest, 0.002) > 0.98
     large, _ = _swaying(0.6, 8.0)
-    assert left(large, 0.25) > 0.95  # a body that really sways
+    assert left(large, 0.025) > 0.95  # a body that really sways
     quick, _ = _swaying(0.04, 0.5)
-    assert left(quick, 1.0) > 0.95
-    still = torch.eye(4).repeat(240, 1, 1)
-    assert torch.allclose(unswayed(still, time, 1.0), still, atol=1e-6)
+    assert left(quick, 0.08) > 0.95
+    assert left(quick, 0.08, slow_s=0.0) < 0.35
+    resting = torch.eye(4).repeat(240, 1, 1)
+    assert torch.allclose(unswayed(resting, time, (1.0, 1.0, 1.0)), resting[:, :3, :3], atol=1e-6)
+
+
+def test_axes_are_told_apart() -> None:
+    """A trunk that turns to and fro about the vertical keeps that; a tilt as small as the root's error goes."""
+    time = np.arange(240) / 20
+    to_and_fro = torch.from_numpy(np.sin(2 * np.pi * time / 6)).float()
+    tilt = 0.02 * torch.from_numpy(np.cos(2 * np.pi * time / 4)).float()
+    sway = so3_exp(torch.stack([tilt, 0.5 * to_and_fro, torch.zeros(240)], 1))
+    taken = unswayed(rigid(sway, torch.zeros(240, 3)), time, (0.04, 0.04, 0.04))
+    vectors = Rotation.from_matrix(taken.numpy()).as_rotvec()
+    assert np.abs(vectors[:, 1]).max() < 0.02
+    assert np.corrcoef(vectors[:, 0], tilt.numpy())[0, 1] > 0.95
+    assert 0.6 * 0.02 < np.abs(vectors[:, 0]).max() < 0.02
+
+
+def test_dividing_brings_the_middle_to_rest_and_a_fixed_turn_whole() -> None:
+    time = np.arange(30) / 20
+    rest = _rigid(1, 0.5, 7).expand(30, -1, -1) @ _rigid(30, 0.1, 8)
+    middle = torch.tensor([0.2, -0.1, 0.3])
+    made = divided(rest, middle, time, (1e-4, 1e-4, 1e-4))
+    before = (invert_rigid(rest) @ torch.cat([middle, torch.ones(1)]))[:, :3]
+    after = (made @ torch.cat([before, torch.ones(30, 1)], 1)[..., None])[:, :3, 0]
+    assert torch.allclose(after, middle.expand(30, 3), atol=1e-5)
+    turns = Rotation.from_matrix(made[:, :3, :3].double().numpy())
+    usual = Rotation.from_matrix(rest[:, :3, :3].double().numpy()).mean()
+    assert (turns * usual.inv()).magnitude().max() < 1e-3  # the trunk keeps its own turns, not where it rests
+    whole = divided(rest, middle, time, (10.0, 10.0, 10.0))
+    assert torch.allclose(whole[:, :3, :3], rest[:, :3, :3], atol=1e-3)
 
 
 def test_given_root_poses_that_jittered_lose_a_wave_and_no_picture_changes(model: Banmo) -> None:
     model.videos = [replace(video, root_given=True) for video in model.videos]
-    model.videos[0] = replace(model.videos[0], root_jitter_rad=2.0)
+    model.videos[0] = replace(model.videos[0], root_wave_rad=(0.2, 0.3, 0.4))
     with torch.no_grad():
         model.body.head.out.weight[:3] *= 8  # so that the trunk sways at all
     time = torch.tensor([0.0, 0.35, 0.7])
@@ -162,4 +193,20 @@ def test_given_root_poses_that_jittered_lose_a_wave_and_no_picture_changes(model
     for video in (0, 1):
         assert torch.allclose(camera(video), before[video], atol=1e-5)
     again = Banmo.restore(dict(model.state_dict()), model.describe())
-    assert [video.root_jitter_rad for video in again.videos] == [2.0, 0.0]
+    assert [video.root_wave_rad for video in again.videos] == [(0.2, 0.3, 0.4), None]
+
+
+def test_estimated_root_poses_of_known_error_settle_in_place_and_turn_no_further(model: Banmo) -> None:
+    with torch.no_grad():
+        model.body.head.out.weight[:3] *= 8
+    video = model.videos[0]
+    turned = {}
+    for wave in (None, (1e-3, 1e-3, 1e-3), (0.3, 0.3, 0.3)):
+        model.gauge.copy_(torch.eye(4).expand_as(model.gauge))
+        model.videos = [replace(v, root_wave_rad=wave) for v in model.videos]
+        settle(model, steady_s=0.0)
+        turns = Rotation.from_matrix(model.gauge[: len(video.time_s), :3, :3].double().numpy())
+        turned[wave] = float((turns * turns.mean().inv()).magnitude().mean())
+    few, half, all_of_it = turned[(1e-3, 1e-3, 1e-3)], turned[(0.3, 0.3, 0.3)], turned[None]
+    assert few < 0.05 * all_of_it
+    assert few < half < 1.05 * all_of_it

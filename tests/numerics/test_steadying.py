@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from stages.registration.steadying import jitter, main_axis, steady
+from stages.registration.steadying import SLOW_S, main_axis, steady, wave_left
 
 FRAMES = 60
 TIME = np.arange(FRAMES) / 20
@@ -97,9 +98,13 @@ def test_a_clip_of_a_few_frames_stays() -> None:
     assert turned_s == (0.0, 0.0) and np.array_equal(made, short)
 
 
-def test_jitter_is_the_root_mean_square_turn_between_two_tracks() -> None:
-    poses = np.tile(np.eye(4), (4, 1, 1))
+def test_the_wave_that_is_left_is_what_smoothing_noise_leaves() -> None:
+    """White turns of a known size, smoothed as wide as SLOW_S, leave what is foretold about each axis."""
+    time = np.arange(4000) / 20
+    noise = np.random.default_rng(0).normal(0.0, 0.1, (len(time), 3))
+    poses = np.tile(np.eye(4), (len(time), 1, 1))
     turned = poses.copy()
-    turned[:2, :3, :3] = Rotation.from_rotvec([[0.0, 0.0, 0.2], [0.2, 0.0, 0.0]]).as_matrix()
-    assert np.isclose(jitter(turned, poses), 0.2 / np.sqrt(2))
-    assert jitter(poses, poses) == 0.0
+    turned[:, :3, :3] = Rotation.from_rotvec(noise).as_matrix()
+    left = gaussian_filter1d(noise, SLOW_S * 20, axis=0)
+    assert np.allclose(wave_left(turned, poses, time), left.std(0), rtol=0.25)
+    assert wave_left(poses, poses, time) == (0.0, 0.0, 0.0)
