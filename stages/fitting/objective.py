@@ -338,7 +338,7 @@ def motion_terms(model: Banmo, frame_idx: Tensor, settings: PhaseSettings) -> di
 
 
 def _turns_allowed(model: Banmo) -> tuple[Tensor, Tensor]:
-    """How far a video's root poses may be turned wrongly about each axis (V, 3), and whether that is known (V,) bool."""
+    """How far videos' root poses may be turned wrongly about each axis (V, 3), and whether that is known (V,) bool."""
     waves = [(_GIVEN_TURN,) * 3 if video.root_given else video.root_wave_rad for video in model.videos]
     off = torch.tensor([wave or (1.0, 1.0, 1.0) for wave in waves], device=model.root_free.device)
     return off, torch.tensor([wave is not None for wave in waves], device=off.device)
