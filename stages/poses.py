@@ -311,7 +311,7 @@ def _track(subject: Subject, answer: Answer) -> formats.PoseTrack:
         transforms(rotation, translation),
         confidence,
         [answer.provider] * len(cues),
-        answer.wave_rad,
+        answer.wave_rad if answer.trust >= LOW_TRUST else None,
     )
 
 

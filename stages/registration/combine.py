@@ -35,7 +35,7 @@ def combine(answers: list[dict[str, Answer]], asked: list[str]) -> dict[str, Ans
         both = [n for n in candidate if n in chosen]
         if not missing:
             continue
-        turn, doubt = np.eye(3), 1.0
+        turn, doubt, first = np.eye(3), 1.0, not chosen
         if both:
             weight = np.concatenate([np.sqrt(chosen[n].confidence * candidate[n].confidence) for n in both])
             turn = common_rotation(
@@ -47,5 +47,7 @@ def combine(answers: list[dict[str, Answer]], asked: list[str]) -> dict[str, Ans
             doubt = UNALIGNED
         for n in missing:
             a = candidate[n]
-            chosen[n] = replace(a, rotation=a.rotation @ turn, trust=a.trust * doubt, confidence=a.confidence * doubt)
+            wave = a.wave_rad if first else None  # about axes of its own frame
+            told = replace(a, trust=a.trust * doubt, confidence=a.confidence * doubt, wave_rad=wave)
+            chosen[n] = replace(told, rotation=a.rotation @ turn)
     return chosen

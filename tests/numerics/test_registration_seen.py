@@ -1,5 +1,7 @@
 """Views of single frames tied together in time: reversals are outvoted, the path comes out smooth and right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,16 @@ def test_trust_is_what_single_frames_say_of_the_path() -> None:
     assert sure.score["agreed"] > 0.85 and 0.4 < torn.score["agreed"] < 0.7
     angles = view_angles(sure.rotation)
     assert np.degrees(np.abs(np.angle(np.exp(1j * (angles[0] - azimuth))))).max() < 12
+
+
+def test_the_ground_makes_tilts_surer() -> None:
+    subject = _subject(np.radians(np.linspace(20, 130, 60)), np.zeros(60, bool))
+    assert subject.view is not None
+    grounded = replace(subject, view=replace(subject.view, ground_elevation=np.full(60, np.radians(30.0))))
+    free, told = (seen([s], 0, lambda *_: None)["clip"] for s in (subject, grounded))
+    assert np.degrees(view_angles(told.rotation)[1]) == pytest.approx(np.full(60, 30.0), abs=0.5)
+    assert free.wave_rad is not None and told.wave_rad is not None
+    assert told.wave_rad[0] < free.wave_rad[0] and told.wave_rad[1] == free.wave_rad[1]
 
 
 def test_clips_without_a_network_get_no_answer() -> None:

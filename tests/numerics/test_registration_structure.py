@@ -66,13 +66,18 @@ def test_answers_in_different_frames_are_brought_together() -> None:
 
     def say(name: str, trusts: dict[str, float], frame: np.ndarray) -> dict[str, Answer]:
         sure = np.ones(5)
-        return {n: Answer(name, truth[n] @ frame, 2 * sure, np.zeros((5, 2)), t * sure, t) for n, t in trusts.items()}
+        return {
+            n: Answer(name, truth[n] @ frame, 2 * sure, np.zeros((5, 2)), t * sure, t, wave_rad=(0.1, 0.2, 0.1))
+            for n, t in trusts.items()
+        }
 
     one, two = say("one", {"a": 0.9, "b": 0.8}, frames[0]), say("two", {"b": 0.5, "c": 0.6}, frames[1])
     chosen = combine([two, one], ["a", "b", "c"])
     assert {n: a.provider for n, a in chosen.items()} == {"a": "one", "b": "one", "c": "two"}
     assert chosen["c"].rotation == pytest.approx(truth["c"] @ frames[0])
     assert chosen["c"].trust == 0.6
+    # what a provider says of the axes of its own object frame holds in that alone
+    assert [chosen[n].wave_rad for n in "abc"] == [(0.1, 0.2, 0.1), (0.1, 0.2, 0.1), None]
     # nothing in common: the second's frame is a guess, and its trust says so
     apart = combine([say("one", {"a": 0.9}, frames[0]), say("two", {"c": 0.6}, frames[1])], ["a", "c"])
     assert apart["c"].trust == pytest.approx(0.3) and apart["c"].confidence == pytest.approx(np.full(5, 0.3))

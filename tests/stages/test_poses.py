@@ -124,6 +124,8 @@ def test_given_poses_that_may_move_lose_their_jitter(tmp_path: Path) -> None:
         found = read_poses(out / "a.json").object_to_camera
         if moves:
             assert error(found) < 0.5 * error(wrong) and run.metrics["steadied_turns_s"] > 0
+            wave = read_poses(out / "a.json").wave_rad
+            assert wave is not None and all(0.01 < w < 0.2 for w in wave)
         else:
             assert np.allclose(found, wrong, atol=1e-6) and "steadied_turns_s" not in run.metrics
         out.rename(tmp_path / f"moves-{moves}")
@@ -213,7 +215,9 @@ def test_the_most_trusted_provider_wins_and_others_fill_in(
                 if s.name in trusts:
                     turn = np.tile(front @ frame, (len(s.cues), 1, 1))
                     sure = np.full(len(s.cues), trusts[s.name])
-                    answers[s.name] = Answer(name, turn, np.full(len(s.cues), 2.0), s.cues.centre_px, sure, sure[0])
+                    answers[s.name] = Answer(
+                        name, turn, np.full(len(s.cues), 2.0), s.cues.centre_px, sure, sure[0], wave_rad=(0.1, 0.2, 0.1)
+                    )
             return answers
 
         return provider
@@ -229,6 +233,11 @@ def test_the_most_trusted_provider_wins_and_others_fill_in(
     first, second = (read_poses(out / f"{n}.json").object_to_camera[0, :3, :3] for n in "ab")
     assert np.abs(first - second).max() < 0.15  # in one frame (up to where each object is in the picture)
     assert summary["trust"] == 0.5 and run.warnings == []
+    assert [read_poses(out / f"{n}.json").wave_rad for n in "ab"] == [(0.1, 0.2, 0.1), None]
+    out.rename(tmp_path / "sure")
+    monkeypatch.setattr(stage_module, "PROVIDERS", {"one": say("one", {"a": 0.4, "b": 0.6}, np.eye(3))})
+    out, _ = run_poses(tmp_path)  # in doubt, nobody knows how far it is off
+    assert [read_poses(out / f"{n}.json").wave_rad for n in "ab"] == [None, (0.1, 0.2, 0.1)]
 
 
 def test_an_empty_mask_is_said(tmp_path: Path) -> None:
