@@ -21,8 +21,7 @@ from stages.model.fields import GridField
 
 _GIVEN_TURN, _GIVEN_SHIFT = 0.4, 0.015
 """Radians, units: how far given root poses that may move are off. Pictures tell a turn well and a
-distance badly, so places are held, turns hardly. Estimated ones whose error is known are held by that, their places
-not at all: those come from the masks."""
+distance badly, so places are held, turns hardly."""
 _SPILL_FREE_PX = 3.0  # as far beside the mask the surface may stick out: rays are drawn there, too
 _PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
 
@@ -327,21 +326,13 @@ def motion_terms(model: Banmo, frame_idx: Tensor, settings: PhaseSettings) -> di
         second = so3_log(rotation[:, 1].transpose(1, 2) @ rotation[:, 2])
         bend = (shift[:, 0] - 2 * shift[:, 1] + shift[:, 2]).norm(dim=-1)
         terms["root"] = settings.weight_root * (((second - first).norm(dim=-1) + bend) * whole).mean()
-        off, held = _turns_allowed(model)
-        held = (held & (model.root_free > 0))[video[:, 1]]
-        if settings.weight_given and bool(held.any()):
-            base, given = model.base_poses[triple[:, 1]], model.root_given[video[:, 1]]
-            turned = so3_log(base[:, :3, :3].transpose(1, 2) @ rotation[:, 1]) / off[video[:, 1]]
-            away = given * (shift[:, 1] - base[:, :3, 3]).square().sum(-1) / _GIVEN_SHIFT**2
-            terms["given"] = settings.weight_given * (held * ((1 + turned.square().sum(-1)).sqrt() - 1 + away)).mean()
+        given = (model.root_given & (model.root_free > 0))[video[:, 1]]
+        if settings.weight_given and bool(given.any()):
+            base = model.base_poses[triple[:, 1]]
+            turn = so3_log(base[:, :3, :3].transpose(1, 2) @ rotation[:, 1]).square().sum(-1) / _GIVEN_TURN**2
+            away = (shift[:, 1] - base[:, :3, 3]).square().sum(-1) / _GIVEN_SHIFT**2
+            terms["given"] = settings.weight_given * (given * ((1 + turn).sqrt() - 1 + away)).mean()
     return terms
-
-
-def _turns_allowed(model: Banmo) -> tuple[Tensor, Tensor]:
-    """How far videos' root poses may be turned wrongly about each axis (V, 3), and whether that is known (V,) bool."""
-    waves = [(_GIVEN_TURN,) * 3 if video.root_given else video.root_wave_rad for video in model.videos]
-    off = torch.tensor([wave or (1.0, 1.0, 1.0) for wave in waves], device=model.root_free.device)
-    return off, torch.tensor([wave is not None for wave in waves], device=off.device)
 
 
 def neighbours(centres: Tensor, most: int = 3) -> tuple[Tensor, Tensor]:

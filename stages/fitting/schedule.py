@@ -106,8 +106,7 @@ class PhaseSettings:
     weight_root: float = 0.5
     """Acceleration of root poses between frames."""
     weight_given: float = 0.01
-    """How firmly the places of given root poses that may move stay near what was given (their turns hardly do), and the
-    turns of estimated ones whose error is known near what was estimated."""
+    """How firmly the places of given root poses that may move stay near what was given; their turns hardly do."""
     match_pixels: int = 192
     """Pixels a step that take part in matching and the 2D cycle."""
     match_every: int = 2
