@@ -30,7 +30,7 @@ WORSE_THAN_USUAL = 0.1
 """So much less overlap than the clip's frames usually have, in any of them, asks for a second look at refined masks."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
-_FIT_FRAMES, _FIT_SHARE = 48, 4  # one pixel in four of these frames, at random
+_FIT_FRAMES = 48
 _ROUNDS = 2
 _STEPS, _PIXELS = 240, 2048
 _BATCH = 8
@@ -148,18 +148,14 @@ def _fitted(colours: np.ndarray, features: np.ndarray, soft: np.ndarray, seed: i
     chosen = good[np.unique(np.linspace(0, len(good) - 1, min(_FIT_FRAMES, len(good))).round().astype(int))]
     if len(chosen) == 0:
         return None
-    draw = np.random.default_rng(seed)
-    values, labels, weights = [], [], []
-    for t in chosen:
-        inside = soft[t] > 0.5
-        some = draw.choice(inside.size, -(-inside.size // _FIT_SHARE), replace=False)
-        away = np.abs(signed_distance(inside)) > _RIM_PX
-        values.append(_seen(colours[t], features[t]).reshape(inside.size, -1)[some])
-        labels.append(inside.ravel()[some].astype(np.float32))
-        weights.append(away.ravel()[some] * trust[t].astype(np.float32))
-    classifier = PixelColours(values[0].shape[-1], seed)
-    all_of_it = (np.concatenate(x) for x in (values, labels, weights))
-    return classifier if classifier.fit(*all_of_it, steps=_STEPS, batch=_PIXELS) else None
+    values = np.stack([_seen(colours[t], features[t]) for t in chosen])
+    inside = soft[chosen] > 0.5
+    away = np.stack([np.abs(signed_distance(m)) > _RIM_PX for m in inside])
+    classifier = PixelColours(values.shape[-1], seed)
+    weight = away * trust[chosen, None, None].astype(np.float32)
+    return (
+        classifier if classifier.fit(values, inside.astype(np.float32), weight, steps=_STEPS, batch=_PIXELS) else None
+    )
 
 
 def _read(classifier: PixelColours, colours: np.ndarray, features: np.ndarray, told: np.ndarray) -> np.ndarray:

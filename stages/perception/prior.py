@@ -16,8 +16,8 @@ from stages.perception.viewpoint import INPUT_PX, PoseNetwork, normalised
 
 CROP_MARGIN = 1.35
 """Side of the crop that is segmented over the longer side of the box."""
-SEARCH_EVERY, BOX_EVERY = 6, 2
-"""Frames between those that are searched with windows, and between those whose box is then made exact."""
+SEARCH_EVERY = 4
+"""Frames between those that are searched with windows."""
 LEAST_SHRINK = 0.8
 """A refined box is never smaller than this share of the box before: refinement tends to fall onto a part."""
 PART_PRICE = 0.2
@@ -50,25 +50,21 @@ def object_prior(frames: np.ndarray, session: PoseNetwork) -> np.ndarray:
 def object_boxes(frames: np.ndarray, session: PoseNetwork) -> np.ndarray | None:
     """(T, 4) box of the object in every frame, in pixels; None where nothing was found at all."""
     count, height, width = frames.shape[:3]
-    searched, exact = (np.unique(np.append(np.arange(0, count, n), count - 1)) for n in (SEARCH_EVERY, BOX_EVERY))
+    searched = np.unique(np.append(np.arange(0, count, SEARCH_EVERY), count - 1))
     found = [candidates(frames[i], session) for i in searched]
     chosen = best_chain(found)
     known = [(i, c.box) for i, c in zip(searched, chosen, strict=True) if c is not None]
     if not known:
         return None
-    boxes = _between(exact, np.array([i for i, _ in known]), np.stack([box for _, box in known]))
+    at = np.array([i for i, _ in known], float)
+    boxes = np.stack([np.interp(np.arange(count), at, [b[k] for _, b in known]) for k in range(4)], 1)
     refined = boxes.copy()
-    for k, crop, probability in _looked_at(frames[exact], boxes, session, mirrored=False):
+    for i, crop, probability in _looked_at(frames, boxes, session, mirrored=False):
         new = _box_of(probability, crop)
         if new is not None:
-            refined[k] = _not_much_smaller(new, boxes[k])
-    refined = _steady(_between(np.arange(count), exact, refined))
+            refined[i] = _not_much_smaller(new, boxes[i])
+    refined = _steady(refined)
     return np.clip(refined, 0, [width, height, width, height])
-
-
-def _between(frames: np.ndarray, known: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Boxes (len(frames), 4) at frames, from those (K, 4) at `known` frames, by straight lines."""
-    return np.stack([np.interp(frames, known, boxes[:, k]) for k in range(4)], 1)
 
 
 def candidates(frame: np.ndarray, session: PoseNetwork, most: int = 6) -> list[Candidate]:
@@ -183,7 +179,7 @@ def _unprompted(frame: np.ndarray, crop: np.ndarray) -> np.ndarray:
 def _looked_at(
     frames: np.ndarray, boxes: np.ndarray, session: PoseNetwork, mirrored: bool
 ) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Index of frame, crop and probability (48, 48) on the crop round each box."""
+    """Frame, crop and probability (48, 48) on the crop round each box."""
     out: list[tuple[int, np.ndarray, np.ndarray]] = []
     for first in range(0, len(frames), _BATCH):
         rows = range(first, min(first + _BATCH, len(frames)))
