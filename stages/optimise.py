@@ -76,8 +76,8 @@ class FitSettings(PhaseSettings):
     flow_steps: tuple[int, ...] = (1, 4)
     """Frame steps of the optical flow that are used, both ways."""
     settle_root: bool = True
-    """At the end, move to the root poses what all bones share, so that the trunk rests in object space; given root
-    poses keep theirs, but for what their jitter may have left in them of a slow sway."""
+    """At the end, move to the root poses what all bones share, so that the trunk rests in object space: as far as it is
+    known how far they may be off (a network's, given ones that jittered), else whole; given ones that are held stay."""
     lr_root: float = 1e-3
     """Step size of the root pose correction; given poses are held whatever it is (see poses.refine)."""
     decay_from: float = 0.6

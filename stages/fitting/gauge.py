@@ -65,7 +65,7 @@ def settle(
                 motion[mine] = divided(motion[mine], middle, time_s, wave)
             steady = steadied(whole[mine] @ invert_rigid(motion[mine]), time_s, steady_s)
             motion[mine] = invert_rigid(steady) @ whole[mine]
-        elif video.root_given and wave is not None and may[i]:
+        elif video.root_given and wave is not None and any(wave) and may[i]:
             free[mine] = True
             rest = rigid_parts(posed[mine], torch.ones(mine.stop - mine.start, dtype=torch.bool), SWAY_SOFTNESS, rounds)
             motion[mine] = rigid(unswayed(rest, time_s, wave, SLOW_S), torch.zeros(len(rest), 3))
@@ -83,8 +83,8 @@ def divided(rest: Tensor, middle: Tensor, time_s: np.ndarray, wave_rad: tuple[fl
     """
     usual = torch.from_numpy(Rotation.from_matrix(rest[:, :3, :3].double().numpy()).mean().as_matrix()).to(rest)
     turn = usual @ unswayed(rest, time_s, wave_rad)
-    before = middle @ invert_rigid(rest)[:, :3, :3].transpose(1, 2) + invert_rigid(rest)[:, :3, 3]
-    return rigid(turn, middle - (turn @ before[..., None]).squeeze(-1))
+    before = _moved(middle[None], invert_rigid(rest))
+    return rigid(turn, middle - (turn @ before.transpose(1, 2)).squeeze(-1))
 
 
 def unswayed(rest: Tensor, time_s: np.ndarray, wave_rad: tuple[float, float, float], slow_s: float = 0.0) -> Tensor:

@@ -31,7 +31,8 @@ USUAL_ROLL_SPREAD = np.radians(5.0)
 TILT_SIGMA = np.radians(1.0)
 """Change of elevation and roll from frame to frame, radians."""
 WAVE_AROUND, WAVE_ON_GROUND, WAVE_ASKEW = np.radians(5.0), np.radians(2.0), np.radians(8.0)
-"""How far a steady path is off: around the object; askew, where the ground tells the elevation; where it does not."""
+"""How far a path is off once it is smooth, radians: around the object; askew where the ground tells the elevation, and
+where it does not."""
 AGREEMENT = np.pi / 4
 CHANCE = 0.25
 """What single frames say, on average, for views within AGREEMENT of a path that has nothing to do with them."""
