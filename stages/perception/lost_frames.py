@@ -14,20 +14,24 @@ import cv2
 import numpy as np
 
 from stages.perception.appearance import PixelColours, coloured_surroundings
-from stages.perception.temporal import intersection_over_union, main_component, resize_maps, signed_distance
+from stages.perception.temporal import disc, intersection_over_union, main_component, resize_maps, signed_distance
 from stages.perception.viewpoint import normalised
 
 LEAST_AGREEMENT = 0.8
 """Overlap of a frame's rough mask and what the classifier says below which the frame counts as lost. Where masks are
 right the two overlap by 0.85 and more (fox and dancer: every frame); the classifier's is the coarser."""
-LEAST_REFINED_AGREEMENT = 0.85
-"""The same of refined masks, which teach better."""
 LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
 LEAST_SIZE = 0.5
 """A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
-WORSE_THAN_USUAL = 0.1
-"""So much less overlap than the clip's frames usually have, in any of them, asks for a second look at refined masks."""
+DOUBTED_SHARE = 0.06
+"""A piece of a mask larger than this share of it, about which it and the classifier differ in any frame, asks for a
+second look at refined masks. Where those are right the largest is 0.05 and less, but for a whole clip's worst frame."""
+OVERRULED_LOGIT = 0.5
+"""A label that the classifier contradicts by more than this is left out when it is taught again: a tail that masks lack
+for a while looks like the rest of the body."""
+CLASSIFIER_SHARE = 2.0
+"""How much the classifier's log-odds count in the second look, beside the refined mask's own."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
 _FIT_FRAMES = 48
@@ -49,79 +53,95 @@ class TrunkNetwork(Protocol):
 class Found:
     """Masks with lost frames mended.
 
-    `probability` (T, h, w) float32 in 0..1; `lost` (T,) bool: which frames were mended; `said` (T, h/2, w/2) float32:
-    what the classifier says of every frame, None where the features do not tell the object.
+    `probability` (T, h, w) float32 in 0..1; `lost` (T,) bool: which frames were mended; `seen`: what the classifier is
+    shown; `said` (T, h/2, w/2) float32: what it says of every frame, None where the features do not tell the object.
     """
 
     probability: np.ndarray
     lost: np.ndarray
+    seen: Looks
     said: np.ndarray | None
 
 
-def find_again(
-    work: list[np.ndarray],
-    soft: np.ndarray,
-    told: np.ndarray,
-    network: TrunkNetwork,
-    seed: int,
-    least: float = LEAST_AGREEMENT,
-) -> Found:
+@dataclass(frozen=True)
+class Looks:
+    """What a clip's pixels look like: `colours` (T, h, w, 12) in their surroundings, `features` (T, h', w', C)."""
+
+    colours: np.ndarray
+    features: np.ndarray
+
+    def of(self, frame_idx: int) -> np.ndarray:
+        """(h, w, 12 + C) both, at the size of the colours."""
+        colours = self.colours[frame_idx]
+        size = colours.shape[1], colours.shape[0]
+        features = cv2.resize(self.features[frame_idx], size, interpolation=cv2.INTER_LINEAR)
+        return np.concatenate([colours, features], axis=-1)
+
+
+def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int) -> Found:
     """Lost frames mended in rough masks: probability `soft` (T, h, w) of the frames `work` (h, w, 3) uint8 RGB.
 
-    `told` (T, h, w) are log-odds from hints; `least` is the overlap below which a frame counts as lost. Other frames
-    come back as they are; so does every frame of a clip in which the features do not tell the object. Worked out at
-    half the size.
+    `told` (T, h, w) are log-odds from hints. Frames that are not lost come back as they are; so does every frame of a
+    clip in which the features do not tell the object. Worked out at half the size.
     """
     height, width = soft.shape[1] // 2, soft.shape[2] // 2
-    colours = np.stack(
-        [coloured_surroundings(cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA)) for x in work]
-    )
+    colours = [coloured_surroundings(cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA)) for x in work]
+    seen = Looks(np.stack(colours), trunk_features(work, network))
     small = resize_maps(soft, width, height)
     hints = resize_maps(told, width, height)
-    features = trunk_features(work, network)
     steady = steadiness(small) > 0.5
     found, agreement = small, np.ones(len(soft))
     for turn in range(_ROUNDS):
-        classifier = _fitted(colours, features, found, seed + 20 + turn)
+        classifier = _fitted(seen, found, seed + 20 + turn)
         if classifier is None:
             break
-        found = np.stack([_read(classifier, *each) for each in zip(colours, features, hints, strict=True)])
+        found = _probable(_read(classifier, seen, hints))
         agreement = np.array([intersection_over_union(a > 0.5, b > 0.5) for a, b in zip(small, found, strict=True)])
-        if (agreement >= least).all():
+        if (agreement >= LEAST_AGREEMENT).all():
             break
     if not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
-        return Found(soft, np.zeros(len(soft), bool), None)
+        return Found(soft, np.zeros(len(soft), bool), seen, None)
     area, again = ((m > 0.5).reshape(len(m), -1).mean(axis=1) for m in (small, found))
     expected = np.interp(np.arange(len(soft)), np.flatnonzero(steady), area[steady])
-    lost = (agreement < least) & (again > LEAST_SIZE * expected)
+    lost = (agreement < LEAST_AGREEMENT) & (again > LEAST_SIZE * expected)
     mended = soft.copy()
     for t in np.flatnonzero(lost):  # the larger of both: a lost frame lacks pieces, and what it has is mostly right
         mended[t] = np.maximum(soft[t], cv2.resize(found[t], soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR))
-    return Found(mended, lost, found)
+    return Found(mended, lost, seen, found)
 
 
-def look_again(
-    work: list[np.ndarray], refined: np.ndarray, told: np.ndarray, network: TrunkNetwork, seed: int, first: Found
-) -> tuple[np.ndarray, np.ndarray]:
-    """Refined masks (T, H, W) with what some frames lost, roughly, and which frames those are, (T,) bool.
+def look_again(refined: np.ndarray, told: np.ndarray, seed: int, first: Found) -> tuple[np.ndarray, np.ndarray]:
+    """Refined masks (T, H, W) and the classifier's opinion of them as one, and which frames that changed, (T,) bool.
 
-    Refining may drop a head in the shade. Where some frame agrees with what the `first` look said by much less than
-    the clip's frames do, the classifier is taught anew, by the refined masks. What it finds is to be refined again.
+    Refining may drop a head in the shade or a tail, in some frames of many. Where a mask and what the `first` look said
+    differ by a whole piece, the classifier is taught anew, by the refined masks; what comes of it is rough, and to be
+    refined again. Masks without such a piece come back as they are, and none changed.
     """
     none = np.zeros(len(refined), bool)
     if first.said is None:
         return refined, none
-    small = resize_maps(refined, first.said.shape[2], first.said.shape[1])
-    overlap = np.array([intersection_over_union(a > 0.5, b > 0.5) for a, b in zip(small, first.said, strict=True)])
-    if (overlap >= np.median(overlap) - WORSE_THAN_USUAL).all():
+    height, width = first.said.shape[1:]
+    small = resize_maps(refined, width, height)
+    if not (largest_piece(small > 0.5, first.said > 0.5) > DOUBTED_SHARE).any():
         return refined, none
-    height, width = work[0].shape[:2]
-    second = find_again(work, resize_maps(refined, width, height), told, network, seed, LEAST_REFINED_AGREEMENT)
-    out = refined.copy()
-    for t in np.flatnonzero(second.lost):
-        again = cv2.resize(second.probability[t], refined.shape[:0:-1], interpolation=cv2.INTER_LINEAR)
-        out[t] = np.maximum(refined[t], again)
-    return out, second.lost
+    classifier = _fitted(first.seen, small, seed + 40, again=True)
+    if classifier is None:
+        return refined, none
+    logits = CLASSIFIER_SHARE * _read(classifier, first.seen, resize_maps(told, width, height))
+    own = np.log((refined + 0.01) / (1.01 - refined))
+    out = _probable(own + resize_maps(logits, refined.shape[2], refined.shape[1]))
+    changed = largest_piece(small > 0.5, resize_maps(out, width, height) > 0.5) > DOUBTED_SHARE / 2
+    return out, changed
+
+
+def largest_piece(masks: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(T,) area of the largest thick piece in which boolean masks (T, h, w) differ, as a share of the mask's."""
+    out = np.zeros(len(masks))
+    for t, (mask, other) in enumerate(zip(masks, others, strict=True)):
+        thick = cv2.morphologyEx((mask ^ other).astype(np.uint8), cv2.MORPH_OPEN, disc(2))
+        areas = cv2.connectedComponentsWithStats(thick, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
+        out[t] = areas.max(initial=0) / max(np.count_nonzero(mask), 1)
+    return out
 
 
 def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:
@@ -141,30 +161,38 @@ def steadiness(soft: np.ndarray) -> np.ndarray:
     return np.clip((area / np.maximum(usual, 1e-9) - 0.6) / 0.3, 0.0, 1.0)
 
 
-def _fitted(colours: np.ndarray, features: np.ndarray, soft: np.ndarray, seed: int) -> PixelColours | None:
-    """A classifier of pixels taught by the masks of steady frames; None where those hold only one class."""
+def _fitted(seen: Looks, soft: np.ndarray, seed: int, again: bool = False) -> PixelColours | None:
+    """A classifier of pixels taught by the masks (T, h, w) of steady frames; None where those hold only one class.
+
+    With `again` it is taught twice, the second time without the labels that the first contradicts.
+    """
     trust = steadiness(soft)
     good = np.flatnonzero(trust > 0)
     chosen = good[np.unique(np.linspace(0, len(good) - 1, min(_FIT_FRAMES, len(good))).round().astype(int))]
     if len(chosen) == 0:
         return None
-    values = np.stack([_seen(colours[t], features[t]) for t in chosen])
+    values = np.stack([seen.of(t) for t in chosen])
     inside = soft[chosen] > 0.5
     away = np.stack([np.abs(signed_distance(m)) > _RIM_PX for m in inside])
-    classifier = PixelColours(values.shape[-1], seed)
     weight = away * trust[chosen, None, None].astype(np.float32)
-    return (
-        classifier if classifier.fit(values, inside.astype(np.float32), weight, steps=_STEPS, batch=_PIXELS) else None
+    for turn in range(1 + again):
+        classifier = PixelColours(values.shape[-1], seed + turn)
+        if not classifier.fit(values, inside.astype(np.float32), weight, steps=_STEPS, batch=_PIXELS):
+            return None
+        if again and turn == 0:
+            logit = classifier.logit(values)
+            weight = weight * np.where(inside, logit > -OVERRULED_LOGIT, logit < OVERRULED_LOGIT)
+    return classifier
+
+
+def _read(classifier: PixelColours, seen: Looks, told: np.ndarray) -> np.ndarray:
+    """(T, h, w) log-odds of every frame, those of hints (T, h, w) added."""
+    return np.stack(
+        [cv2.GaussianBlur(classifier.logit(seen.of(t)), (0, 0), 0.6) + told[t] for t in range(len(seen.colours))]
     )
 
 
-def _read(classifier: PixelColours, colours: np.ndarray, features: np.ndarray, told: np.ndarray) -> np.ndarray:
-    logit = cv2.GaussianBlur(classifier.logit(_seen(colours, features)), (0, 0), 0.6) + told
-    probability = (1.0 / (1.0 + np.exp(-logit))).astype(np.float32)
-    return main_component(probability > 0.5, probability) * probability
-
-
-def _seen(colours: np.ndarray, features: np.ndarray) -> np.ndarray:
-    """(h, w, K + C): both at the size of the colours."""
-    size = colours.shape[1], colours.shape[0]
-    return np.concatenate([colours, cv2.resize(features, size, interpolation=cv2.INTER_LINEAR)], axis=-1)
+def _probable(logits: np.ndarray) -> np.ndarray:
+    """(T, h, w) probability, of the main piece of every frame alone."""
+    found = 1.0 / (1.0 + np.exp(-logits.astype(np.float32)))
+    return np.stack([main_component(x > 0.5, x) * x for x in found])

@@ -4,7 +4,7 @@
 2. A pixel classifier is fitted to it over the whole clip, so that frames without motion profit from those with it;
    where the object is, is carried between frames by flow.
 3. Where that lost an object of a known category, features of the categories' network find it again (`lost_frames`);
-   once more after the next step, where that has lost a part.
+   once more after the next step, where that has lost a part, and then that step again.
 4. What a category's network knows: one that has learnt to mend rough masks (`refining`) does so at the pictures' own
    size. Anything else: the same again on plain colours, leaving the uncertain rim of the mask out of the fit; this
    tightens the outline.
@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import cv2
@@ -37,7 +37,6 @@ MOTION_SIDE_PX = 192  # motion tells no more at 256, at five times the work
 CARRY_SIDE_PX = 128
 LEAST_PRIOR_AREA = 2e-3
 LEAST_PRIOR_SCORE = 0.35
-REFINED_AGAIN = 2  # times, where a part was lost: a head comes back half by the first, whole by the second
 OUTLINE_REACH_PX = 4.0  # at the working size
 Tick = Callable[[int, int, str], None]
 
@@ -138,12 +137,11 @@ def segment(
     if refiner is not None and refined:
         # Not of a tightened mask: where colours were wrong, that one has lost what the network would have seen.
         soft = refined_probability(images, soft, told, refiner, effort)
-        if trunk is not None and found is not None:
-            soft, more = look_again(work, soft, told, trunk, effort.seed, found)
-            if more.any():
-                again = replace(effort, refinements=REFINED_AGAIN)
-                soft[more] = refined_probability(images[more], soft[more], told[more], refiner, again)
-            lost = lost | more
+        if found is not None:
+            again, changed = look_again(soft, told, effort.seed, found)
+            if again is not soft:
+                soft = refined_probability(images, again, told, refiner, effort)
+            lost = lost | changed
     else:
         soft = tight_probability(work, soft, cues, known, effort)
     tick(2, 2, "learning")
