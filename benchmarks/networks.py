@@ -21,9 +21,9 @@ import torch
 import tyro
 
 from stages.decoding import read_frames
-from stages.own_networks import CATEGORIES, OwnNetwork
+from stages.own_networks import CATEGORIES, OwnFinder, OwnNetwork
 from stages.perception.descriptors import crop_box, crop_resize
-from stages.perception.prior import object_prior
+from stages.perception.prior import object_priors
 from stages.perception.viewpoint import (
     AZIMUTH_DEG,
     INPUT_PX,
@@ -175,7 +175,8 @@ def clips(folder: Path, category: str, look: str, every: int = 3) -> Row:
         area = np.stack([crop_resize(m.astype(np.float32), c, side) > 0.5 for m, c in zip(mask, crops, strict=True)])
         masks.append(overlap(answer["dense"][:, 0] > 0, area))
         named.append((answer["category"].argmax(1) == CATEGORIES.index(category)).mean())
-        priors.append(overlap(object_prior(frames, network) > 127, mask))
+        prior = object_priors(frames, OwnFinder(), {category: CATEGORIES.index(category)})[category]
+        priors.append(overlap(prior > 127, mask))
     error = np.concatenate(errors)
     return Row(f"{folder.name}, {look}", float(np.median(error)), float(error.mean()), float((error > 90).mean()),
                float(np.median(np.concatenate(turns))), str(votes), float(np.mean(masks)), float(np.mean(priors)),

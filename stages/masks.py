@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 
 from pipeline import BadInput, Folder, Given, InputFile, Resources, Run, Video, stage
 from stages.decoding import list_images, read_frames
@@ -32,10 +31,10 @@ from stages.formats import (
     write_mask_facts,
 )
 from stages.networks import NO_FILE, PromptedMaskNetwork, mask_network
-from stages.own_networks import CATEGORIES, OwnNetwork, OwnRefiner, OwnTrunk
+from stages.own_networks import CATEGORIES, OwnFinder, OwnRefiner, OwnTrunk
 from stages.perception.background import shrink
 from stages.perception.optical_flow import Matcher, sample
-from stages.perception.prior import object_prior
+from stages.perception.prior import object_priors
 from stages.perception.prompts import Prompt, prompts_of
 from stages.perception.segmentation import Effort, Hint, Segmentation, segment
 from stages.perception.sheets import mask_sheet
@@ -66,8 +65,7 @@ class MaskSettings:
 @stage(per=Video, version=1, given=(".masks", ".masks.mp4", ".hints.toml"), needs=Resources(cpus=1))
 def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: Run) -> None:
     """Foreground probability of every frame, one 8-bit PNG each; `masks.json` says who answered and how sure it is."""
-    cv2.setNumThreads(1)  # DIS gives other digits with other thread counts, and so does torch
-    torch.set_num_threads(1)
+    cv2.setNumThreads(1)  # DIS gives other digits with other thread counts
     clip = read_clip(frames.path)
     folder, video = given.get(".masks"), given.get(".masks.mp4")
     if folder is not None:
@@ -98,16 +96,16 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
 
 
 def _priors(images: np.ndarray, category: str, run: Run) -> dict[str, np.ndarray]:
-    """Each category network's idea of the object, (T, H, W) uint8; only the named one's if the settings name it."""
+    """What a network of ours takes for the object, (T, H, W) uint8 a category; of the named one alone if one is."""
     if category not in ("auto", "other", *CATEGORIES):
         known = ", ".join(("auto", *CATEGORIES, "other"))
         raise BadInput(f"masks.category is {category!r}", hint=f"known: {known}")
     wanted = {"auto": CATEGORIES, "other": ()}.get(category, (category,))
-    found = {}
-    for name in wanted:
-        run.tick(len(found), len(wanted), label=f"looking for a {name}")
-        found[name] = object_prior(images, OwnNetwork(name, device=run.device, threads=run.threads))
-    return found
+    if not wanted:
+        return {}
+    run.tick(0, 1, label=f"looking for a {' or a '.join(wanted)}")
+    network = OwnFinder(device=run.device, threads=run.threads)
+    return object_priors(images, network, {name: CATEGORIES.index(name) for name in wanted})
 
 
 def _ticker(run: Run) -> Callable[[int, int, str], None]:

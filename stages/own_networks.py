@@ -18,6 +18,7 @@ DIGESTS = {
     "quadruped.npz": "08131d368bb1b29ac53b50747c55186bab028996b8e0a1b92598f7c03aaa02ed",
     "human.npz": "95b6eebf697fe08a808e36dd866b8130d306c1b612b96f3e7979c2fc18e4e99e",
     "refine.onnx": "17f7c6e0c7398a56703b091661eea1eee1147bd68a12c0da2697fc367e26d4f2",
+    "finder.onnx": "64fb4b9d91959e290ab55cdc0e1ffe7efb2391deac48346fd59bb1ea831ee9cd",
     "trunk.onnx": "e16cd52a6258a3b27a5a76f7004fa32c17e3b003f5f53462bc86cacae0dd09e3",
     "quadruped-skeleton.npz": "aabfb977e9d3dab9fc71b28930737a8da2837fa47dfe0ac5b703ca83574b950a",
     "human-skeleton.npz": "a2f5140035bcfba243a3ac916b55fa8c415e76c00904a8233e49cd5872d2d111",
@@ -73,6 +74,17 @@ class OwnTrunk(_OwnFile):
         """(N, 64, H/8, W/8) features of (N, 3, H, W) float32, H and W multiples of 16."""
         (features,) = self._session.run(["features"], {"image": inputs.astype(np.float32)})
         return np.asarray(features)
+
+
+class OwnFinder(_OwnFile):
+    """Masks of all categories on pictures of any size (see stages.perception.prior.FindingNetwork)."""
+
+    name = "finder.onnx"
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """(N, len(CATEGORIES), H/2, W/2) logits of (N, 3, H, W) float32, H and W multiples of 16."""
+        (masks,) = self._session.run(["masks"], {"image": images.astype(np.float32)})
+        return np.asarray(masks)
 
 
 def canonical_surface(category: str) -> dict[str, np.ndarray]:

@@ -5,9 +5,10 @@
 For every category: ``cse-<category>.onnx`` (picture 1x3xHxW, normalised by ImageNet's mean and deviation, H and W
 multiples of 16 -> 17 channels at half the size: mask logit, then a 16-D embedding of unit length),
 ``posenet-<category>.onnx`` (4x96x96: picture and mask -> `view` 60 logits, `dense` 17x48x48, `category` 3 logits) and
-``<category>.npz`` (vertices, faces, embedding of the canonical surface); and ``trunk.onnx``, what the categories share
-(picture 1x3xHxW -> 64 features at an eighth of the size). Batch normalisation is folded into the
-convolutions; weights are kept in half precision and widened when the file is opened.
+``<category>.npz`` (vertices, faces, embedding of the canonical surface); and, of what the categories share,
+``trunk.onnx`` (picture 1x3xHxW -> 64 features at an eighth of the size) and ``finder.onnx`` (picture 1x3xHxW -> mask
+logits of every category at half the size). Batch normalisation is folded into the convolutions; weights are kept in
+half precision and widened when the file is opened.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from synthetic.canonical import canonical_body
 from training.losses import Surface
 from training.network import CATEGORIES, EMBEDDING, INPUT_PX, VIEW_OUTPUTS, Network
 from training.refine import Refiner, averaged_refiner
-from training.revive import revive_trunk
+from training.revive import revive_masks, revive_trunk
 from training.train import make_surface, read_state
 
 log = logging.getLogger(__name__)
@@ -188,6 +189,14 @@ def trunk_model(network: Network, provenance: dict[str, str]) -> onnx.ModelProto
     return _finish(g, [image], outputs, "trunk", provenance)
 
 
+def finder_model(network: Network, provenance: dict[str, str]) -> onnx.ModelProto:
+    """Picture N x 3 x H x W -> `masks` N x K x H/2 x W/2: mask logits of all categories, as `cse_model` has them."""
+    g = _Graph()
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 3, "h", "w"])
+    masks = g.convolve(_trunk(g, network, _halve(g, _unmasked(g, "image")))["fine2"], network.mask)
+    return _finish(g, [image], {"masks": (masks, ["n", len(CATEGORIES), "h2", "w2"])}, "finder", provenance)
+
+
 def posenet_model(network: Network, category: int, provenance: dict[str, str]) -> onnx.ModelProto:
     """Picture and mask N x 4 x 96 x 96 -> `view` N x 60, `dense` N x 17 x 48 x 48, `category` N x 3."""
     g = _Graph()
@@ -244,17 +253,22 @@ def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]
             )
         part.replace(out / f"{name}.npz")
         digests[f"{name}.npz"] = hashlib.sha256((out / f"{name}.npz").read_bytes()).hexdigest()
-    digests["trunk.onnx"] = _write_model(out / "trunk.onnx", trunk_model(network, provenance))
-    return digests
+    return digests | _write_shared(network, out, provenance)
 
 
-def trunk_of(path: Path, out: Path) -> dict[str, str]:
-    """Write ``trunk.onnx`` of an exported category's network; returns its sha256 by name."""
+def shared_of(path: Path, out: Path) -> dict[str, str]:
+    """Write ``trunk.onnx`` and ``finder.onnx`` of an exported category's PoseNet; returns their sha256 by name."""
     network = Network().eval()
     revive_trunk(network, path)
+    revive_masks(network.mask, path)
     provenance = {p.key: p.value for p in onnx.load(path).metadata_props}
     out.mkdir(parents=True, exist_ok=True)
-    return {"trunk.onnx": _write_model(out / "trunk.onnx", trunk_model(network, provenance))}
+    return _write_shared(network, out, provenance)
+
+
+def _write_shared(network: Network, out: Path, provenance: dict[str, str]) -> dict[str, str]:
+    models = {"trunk.onnx": trunk_model(network, provenance), "finder.onnx": finder_model(network, provenance)}
+    return {name: _write_model(out / name, model) for name, model in models.items()}
 
 
 def _write_model(path: Path, model: onnx.ModelProto) -> str:
@@ -273,12 +287,13 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
 
     Args:
         state: The `state.safetensors` of a training run (`log.jsonl` beside it), or the `refine.safetensors` of a
-            refiner's (`refine.jsonl` beside it), or an exported `posenet-<category>.onnx`, for its `trunk.onnx`.
+            refiner's (`refine.jsonl` beside it), or an exported `posenet-<category>.onnx`, for what the
+            categories share.
         out: Folder to write to.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if state.suffix == ".onnx":
-        _log(trunk_of(state, out))
+        _log(shared_of(state, out))
         return
     refining = state.stem == "refine"
     lines = (state.parent / ("refine.jsonl" if refining else "log.jsonl")).read_text(encoding="utf-8").splitlines()

@@ -48,6 +48,19 @@ def revive_trunk(trunk: Network, path: Path) -> None:
     _give(layers, weights)
 
 
+def revive_masks(head: nn.Conv2d, path: Path) -> None:
+    """Give the head of all categories' masks the weights of an exported PoseNet.
+
+    Raises:
+        ValueError: the file holds no such head, or more than one.
+    """
+    weights = _weights(path)
+    found = [k for k, w in enumerate(weights) if w.shape == tuple(head.weight.shape)]
+    if len(found) != 1:
+        raise ValueError(f"{path} holds {len(found)} heads of masks, one expected")
+    _give([(head, None)], weights[found[0] :])
+
+
 def _weights(path: Path) -> list[np.ndarray]:
     return [numpy_helper.to_array(w) for w in onnx.load(path).graph.initializer if w.name.startswith("w_")]
 

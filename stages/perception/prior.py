@@ -1,18 +1,21 @@
-"""Where a network that knows the category thinks the object is: coarse, but with no hint and no motion needed.
+"""Where a network that knows the categories thinks the object is: coarse, but with no hint and no motion needed.
 
-First windows of three sizes over some of the frames give candidates; the chain of candidates that fits together best
-over time gives a box a frame; then every frame is looked at again on a crop round its box, twice.
+First windows of three sizes over some of the frames give candidates of every category; the chain of candidates that
+fits together best over time gives a box a frame; then every frame is looked at again on a crop round its box, twice.
+One network sees all categories at once, and neighbouring windows of one size in one go.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 
 from stages.perception.descriptors import crop_resize
-from stages.perception.viewpoint import INPUT_PX, PoseNetwork, normalised
+from stages.perception.viewpoint import INPUT_PX, normalised
 
 CROP_MARGIN = 1.35
 """Side of the crop that is segmented over the longer side of the box."""
@@ -22,7 +25,23 @@ LEAST_SHRINK = 0.8
 """A refined box is never smaller than this share of the box before: refinement tends to fall onto a part."""
 PART_PRICE = 0.2
 """What it costs a candidate to lie within a larger one, and brings that one."""
+SMALL_WINDOW = 0.6
+"""Side of the smallest windows over the picture's shorter side."""
+LEAST_SURE = 0.5
+"""A category that the searched frames show with less than this share of the surest one's certainty is not looked at
+again."""
 _BATCH = 16
+_MULTIPLE = 16  # of pixels, what the network takes
+_HALF = INPUT_PX // 2
+
+
+class FindingNetwork(Protocol):
+    """As training/export.py writes it."""
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """(N, K, H/2, W/2) mask logits of K categories, of (N, 3, H, W) pictures normalised by ImageNet's mean and
+        deviation, H and W multiples of 16."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,57 +52,115 @@ class Candidate:
     score: float
 
 
-def object_prior(frames: np.ndarray, session: PoseNetwork) -> np.ndarray:
-    """(T, H, W) uint8 probability (255 = 1) that a pixel of `frames` (T, H, W, 3) uint8 RGB shows the object.
+def object_priors(frames: np.ndarray, network: FindingNetwork, categories: dict[str, int]) -> dict[str, np.ndarray]:
+    """Of each category that may be it, (T, H, W) uint8 probability (255 = 1) that a pixel shows the object.
 
-    All zero where nothing of the category was found in any frame.
+    `frames` is (T, H, W, 3) uint8 RGB; `categories` says which of the network's channels is whose. All zero where
+    nothing of the category was found in any frame; a category that is seen much worse than another is left out.
     """
-    boxes = object_boxes(frames, session)
-    if boxes is None:
-        return np.zeros(frames.shape[:3], np.uint8)
+    boxes = searched_boxes(frames, network, tuple(categories.values()))
+    sure = {k: _certainty(frames[::SEARCH_EVERY], b[::SEARCH_EVERY], network, k) for k, b in boxes.items()}
+    least = LEAST_SURE * max(sure.values(), default=0.0)
+    out = {}
+    for name, channel in categories.items():
+        if channel not in boxes:
+            out[name] = np.zeros(frames.shape[:3], np.uint8)
+        elif sure[channel] >= least:
+            out[name] = _object_prior(frames, refined_boxes(frames, boxes[channel], network, channel), network, channel)
+    return out
+
+
+def searched_boxes(frames: np.ndarray, network: FindingNetwork, channels: tuple[int, ...]) -> dict[int, np.ndarray]:
+    """(T, 4) box in pixels of the object in every frame, by channel; those that found nothing at all are missing."""
+    count = len(frames)
+    searched = np.unique(np.append(np.arange(0, count, SEARCH_EVERY), count - 1))
+    found = [candidates(frames[i], network, channels) for i in searched]
+    out = {}
+    for channel in channels:
+        chosen = best_chain([row[channel] for row in found])
+        known = [(i, c.box) for i, c in zip(searched, chosen, strict=True) if c is not None]
+        if known:
+            at = np.array([i for i, _ in known], float)
+            out[channel] = np.stack([np.interp(np.arange(count), at, [b[k] for _, b in known]) for k in range(4)], 1)
+    return out
+
+
+def refined_boxes(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> np.ndarray:
+    """(T, 4) boxes round what the network sees on crops round the boxes before."""
+    height, width = frames.shape[1:3]
+    refined = boxes.copy()
+    for i, crop, probability in _looked_at(frames, boxes, network, channel):
+        new = _box_of(probability, crop)
+        if new is not None:
+            refined[i] = _not_much_smaller(new, boxes[i])
+    return np.clip(_steady(refined), 0, [width, height, width, height])
+
+
+def _object_prior(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> np.ndarray:
     out = np.zeros(frames.shape[:3], np.uint8)
-    for i, crop, probability in _looked_at(frames, boxes, session, mirrored=True):
+    for i, crop, probability in _looked_at(frames, boxes, network, channel, mirrored=True):
         out[i] = np.round(255 * paste(probability, crop, frames.shape[1], frames.shape[2])).astype(np.uint8)
     return out
 
 
-def object_boxes(frames: np.ndarray, session: PoseNetwork) -> np.ndarray | None:
-    """(T, 4) box of the object in every frame, in pixels; None where nothing was found at all."""
-    count, height, width = frames.shape[:3]
-    searched = np.unique(np.append(np.arange(0, count, SEARCH_EVERY), count - 1))
-    found = [candidates(frames[i], session) for i in searched]
-    chosen = best_chain(found)
-    known = [(i, c.box) for i, c in zip(searched, chosen, strict=True) if c is not None]
-    if not known:
-        return None
-    at = np.array([i for i, _ in known], float)
-    boxes = np.stack([np.interp(np.arange(count), at, [b[k] for _, b in known]) for k in range(4)], 1)
-    refined = boxes.copy()
-    for i, crop, probability in _looked_at(frames, boxes, session, mirrored=False):
-        new = _box_of(probability, crop)
-        if new is not None:
-            refined[i] = _not_much_smaller(new, boxes[i])
-    refined = _steady(refined)
-    return np.clip(refined, 0, [width, height, width, height])
+def _certainty(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> float:
+    """How surely the frames show an object of the category, 0..1: probability on it over all that is not surely off."""
+    maps = np.stack([probability for _, _, probability in _looked_at(frames, boxes, network, channel)])
+    inside = maps > 0.5
+    present = float(inside.reshape(len(maps), -1).any(axis=1).mean())
+    return present * float(maps[inside].sum()) / max(np.count_nonzero(maps > 0.2), 1)
 
 
-def candidates(frame: np.ndarray, session: PoseNetwork, most: int = 6) -> list[Candidate]:
-    """Objects that windows of three sizes over one frame (H, W, 3) show, best first."""
+def candidates(
+    frame: np.ndarray, network: FindingNetwork, channels: tuple[int, ...], most: int = 6
+) -> dict[int, list[Candidate]]:
+    """Objects of each channel that windows of three sizes over one frame (H, W, 3) show, best first."""
     height, width = frame.shape[:2]
-    crops = windows(height, width)
-    found: list[Candidate] = []
-    for first in range(0, len(crops), _BATCH):
-        part = crops[first : first + _BATCH]
-        answer = session(np.stack([_unprompted(frame, crop) for crop in part]))
-        dense = _sigmoid(answer["dense"][:, 0])
-        for crop, probability in zip(part, dense, strict=True):
-            found += _in_window(probability, crop, height, width)
-    found = sorted(_whole_before_part(found), key=lambda c: -c.score)
-    kept: list[Candidate] = []
-    for c in found:
-        if all(overlap(c.box, other.box) < 0.6 for other in kept):
-            kept.append(c)
-    return kept[:most]
+    found: dict[int, list[Candidate]] = {channel: [] for channel in channels}
+    for crop, logits in window_logits(frame, network):
+        for channel in channels:
+            found[channel] += _in_window(_sigmoid(logits[channel]), crop, height, width)
+    out = {}
+    for channel in channels:
+        kept: list[Candidate] = []
+        for c in sorted(_whole_before_part(found[channel]), key=lambda c: -c.score):
+            if all(overlap(c.box, other.box) < 0.6 for other in kept):
+                kept.append(c)
+        out[channel] = kept[:most]
+    return out
+
+
+def window_logits(frame: np.ndarray, network: FindingNetwork) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Square windows (4,) x0, y0, x1, y1 over a frame (H, W, 3), and the network's logits (K, 48, 48) in each.
+
+    The whole picture, and windows that overlap by half of the shorter side and of 0.6 of it. Windows of one size are
+    cut from one pass over the picture.
+    """
+    height, width = frame.shape[:2]
+    long, short = max(height, width), min(height, width)
+    centre = np.array([width / 2, height / 2])
+    whole = np.concatenate([centre - long / 2, centre + long / 2])
+    yield whole, network(normalised(crop_resize(frame, whole, INPUT_PX))[None])[0]
+    for side in (short, SMALL_WINDOW * short):
+        if side >= long:
+            continue
+        scale = INPUT_PX / side
+        size = max(INPUT_PX, round(width * scale)), max(INPUT_PX, round(height * scale))
+        picture = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        padding = [(0, -n % _MULTIPLE) for n in (size[1], size[0])]
+        logits = network(normalised(np.pad(picture, [*padding, (0, 0)]))[None])[0]
+        unit = np.array([width, height]) / size * 2  # pixels of the frame a cell of the logits
+        for y in _starts(size[1] // 2):
+            for x in _starts(size[0] // 2):
+                low = np.array([x, y]) * unit
+                crop = np.concatenate([low, low + _HALF * unit])
+                yield crop, logits[:, y : y + _HALF, x : x + _HALF]
+
+
+def _starts(cells: int) -> list[int]:
+    """Where windows of 48 cells begin that cover so many and overlap by half."""
+    number = int(np.ceil((cells - _HALF) / (0.5 * _HALF) - 1e-6)) + 1
+    return [int(v) for v in np.round(np.linspace(0, cells - _HALF, number))]
 
 
 def _whole_before_part(found: list[Candidate]) -> list[Candidate]:
@@ -105,20 +182,6 @@ def _inside(part: np.ndarray, whole: np.ndarray) -> float:
     """Share of a box's area that lies in another box."""
     shared = np.clip(np.minimum(part[2:], whole[2:]) - np.maximum(part[:2], whole[:2]), 0, None)
     return float(np.prod(shared)) / max(_area(part), 1e-9)
-
-
-def windows(height: int, width: int) -> list[np.ndarray]:
-    """Square crops (4,) x0, y0, x1, y1: the whole picture, and windows of the shorter side and of 0.6 of it."""
-    long, short = max(height, width), min(height, width)
-    centre = np.array([width / 2, height / 2])
-    out = [np.concatenate([centre - long / 2, centre + long / 2])]
-    for side in (short, 0.6 * short):
-        across, down = (max(1, int(np.ceil((n - side) / (0.5 * side) - 1e-6)) + 1) for n in (width, height))
-        for y in np.linspace(0, height - side, down) if down > 1 else [(height - side) / 2]:
-            for x in np.linspace(0, width - side, across) if across > 1 else [(width - side) / 2]:
-                if side < long:
-                    out.append(np.array([x, y, x + side, y + side]))
-    return out
 
 
 def best_chain(found: list[list[Candidate]]) -> list[Candidate | None]:
@@ -170,27 +233,19 @@ def paste(probability: np.ndarray, crop: np.ndarray, height: int, width: int) ->
     return cv2.remap(probability.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
-def _unprompted(frame: np.ndarray, crop: np.ndarray) -> np.ndarray:
-    """(4, 96, 96) input of a crop whose mask is not known."""
-    image = normalised(crop_resize(frame, crop, INPUT_PX))
-    return np.concatenate([image, np.zeros_like(image[:1])])
-
-
 def _looked_at(
-    frames: np.ndarray, boxes: np.ndarray, session: PoseNetwork, mirrored: bool
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Frame, crop and probability (48, 48) on the crop round each box."""
-    out: list[tuple[int, np.ndarray, np.ndarray]] = []
+    frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int, mirrored: bool = False
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Frame, crop and probability (48, 48) on the crop round each box; `mirrored` asks about the mirror image, too."""
     for first in range(0, len(frames), _BATCH):
         rows = range(first, min(first + _BATCH, len(frames)))
         crops = [_square(boxes[i]) for i in rows]
-        inputs = np.stack([_unprompted(frames[i], crop) for i, crop in zip(rows, crops, strict=True)])
-        logits = session(inputs)["dense"][:, 0]
+        inputs = [normalised(crop_resize(frames[i], crop, INPUT_PX)) for i, crop in zip(rows, crops, strict=True)]
+        images = np.stack(inputs)
+        logits = network(images)[:, channel]
         if mirrored:
-            turned = session(np.ascontiguousarray(inputs[..., ::-1]))["dense"][:, 0, :, ::-1]
-            logits = 0.5 * (logits + turned)
-        out += list(zip(rows, crops, _sigmoid(logits), strict=True))
-    return out
+            logits = 0.5 * (logits + network(np.ascontiguousarray(images[..., ::-1]))[:, channel, :, ::-1])
+        yield from zip(rows, crops, _sigmoid(logits), strict=True)
 
 
 def _square(box: np.ndarray) -> np.ndarray:

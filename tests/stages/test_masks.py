@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +205,36 @@ def test_pixel_colours_learn_and_refuse_one_class() -> None:
     assert model.fit(values, label, np.ones(4000, np.float32), steps=150)
     assert ((model.logit(values) > 0) == (label > 0.5)).mean() > 0.95
     assert not PixelColours(3, seed=1).fit(values, np.zeros(4000), np.ones(4000))
+
+
+def test_the_gradient_of_pixel_colours_is_that_of_their_loss() -> None:
+    rng = np.random.default_rng(2)
+    model = PixelColours(5, seed=1)
+    inputs = rng.normal(0, 1, (400, 5)).astype(np.float32)
+    wanted, trust = (rng.random((2, 400)) > 0.5).astype(np.float32)
+    trust += 0.1
+
+    def loss() -> float:
+        odds = model.logit(inputs).astype(float)  # of values that are scaled by one: the network's own
+        assert np.abs(odds).max() < 6, "not clipped"
+        return float((trust * (np.log1p(np.exp(odds)) - wanted * odds)).mean())
+
+    model._all *= 0.5
+    gradient = model._gradient(inputs, wanted, trust)
+    for _ in range(5):
+        way = gradient / np.linalg.norm(gradient) + rng.normal(0, 0.03, len(gradient)).astype(np.float32)
+        model._all += 1e-3 * way
+        ahead = loss()
+        model._all -= 2e-3 * way
+        slope = (ahead - loss()) / 2e-3
+        model._all += 1e-3 * way
+        assert slope == pytest.approx(float(gradient @ way), rel=0.03)
+
+
+def test_masks_and_features_do_without_torch() -> None:
+    """It takes longer to import than a short clip's masks."""
+    code = "import sys, stages.masks, stages.features, stages.flow; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_flags_boxes_and_components() -> None:

@@ -10,9 +10,17 @@ import onnxruntime
 import pytest
 
 from stages import own_networks
-from stages.own_networks import CATEGORIES, WEIGHTS, OwnNetwork, OwnRefiner, WeightsDamaged, canonical_surface
+from stages.own_networks import (
+    CATEGORIES,
+    WEIGHTS,
+    OwnFinder,
+    OwnNetwork,
+    OwnRefiner,
+    WeightsDamaged,
+    canonical_surface,
+)
 from stages.perception.category import choose_category
-from stages.perception.prior import object_prior
+from stages.perception.prior import object_priors
 from stages.perception.refining import refine
 from stages.perception.viewpoint import AZIMUTH_DEG, angle_log_probabilities
 from stages.registration.placing import ray_rotation, view_angles
@@ -39,6 +47,16 @@ def test_files_are_small_and_as_described(category: str) -> None:
     assert session.get_modelmeta().custom_metadata_map["trained_on"].startswith("renderings of generated bodies")
     answer = OwnNetwork(category)(np.zeros((3, 4, 96, 96), np.float32))
     assert {k: v.shape for k, v in answer.items()} == {"view": (3, 60), "dense": (3, 17, 48, 48), "category": (3, 3)}
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_the_finder_sees_what_each_category_s_network_does(category: str) -> None:
+    assert (WEIGHTS / OwnFinder.name).stat().st_size <= 8_000_000
+    crops = np.random.default_rng(0).normal(size=(2, 4, 96, 96)).astype(np.float32)
+    crops[:, 3] = 0
+    dense = OwnNetwork(category)(crops)["dense"][:, 0]
+    np.testing.assert_allclose(OwnFinder()(crops[:, :3])[:, CATEGORIES.index(category)], dense, atol=1e-4)
+    assert OwnFinder()(np.zeros((1, 3, 64, 128), np.float32)).shape == (1, len(CATEGORIES), 32, 64)
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -106,6 +124,7 @@ def test_category_and_prior_mask_of_an_unseen_body(clip: Film) -> None:
     masks = clip.masks.astype(np.uint8) * 255
     networks = {name: OwnNetwork(name) for name in CATEGORIES}
     assert choose_category(clip.images, masks, networks).category == category
-    found = object_prior(clip.images, networks[category]) > 127
+    priors = object_priors(clip.images, OwnFinder(), {name: k for k, name in enumerate(CATEGORIES)})
+    found = priors[category] > 127
     overlap = (found & clip.masks).sum((1, 2)) / (found | clip.masks).sum((1, 2))
     assert overlap.mean() > 0.6

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from stages.perception.category import OTHER, choose_category
-from stages.perception.prior import Candidate, best_chain, object_boxes, object_prior, overlap, paste, windows
+from stages.perception.prior import (
+    Candidate,
+    best_chain,
+    object_priors,
+    overlap,
+    paste,
+    refined_boxes,
+    searched_boxes,
+    window_logits,
+)
 from stages.perception.viewpoint import (
     AZIMUTH_DEG,
     ELEVATION_DEG,
@@ -108,13 +117,30 @@ def test_box_leaves_specks_out() -> None:
     assert not mask_box(np.zeros((20, 20), np.uint8)).any()
 
 
-def test_windows_cover_the_picture() -> None:
-    for height, width in ((90, 160), (160, 90), (128, 128)):
-        seen = np.zeros((height, width), int)
-        for x0, y0, x1, y1 in windows(height, width):
-            assert x1 - x0 == pytest.approx(y1 - y0)
-            seen[max(0, round(y0)) : round(y1), max(0, round(x0)) : round(x1)] += 1
-        assert seen.min() >= 2
+def red_and_blue(images: np.ndarray) -> np.ndarray:
+    """Logits of two categories: red pixels, and (less surely) blue ones."""
+    image = images * IMAGENET_STD[:, None, None] + IMAGENET_MEAN[:, None, None]
+    red = (image[:, 0] > 0.6) & (image[:, 1] < 0.3)
+    blue = (image[:, 2] > 0.6) & (image[:, 1] < 0.3)
+    return np.stack([np.where(red, 6.0, -6.0), np.where(blue, 0.3, -1.0)], 1)[:, :, ::2, ::2]
+
+
+@pytest.mark.parametrize(("height", "width"), [(90, 160), (160, 90), (128, 128), (270, 480)])
+def test_windows_cover_the_picture_and_say_where_they_are(height: int, width: int) -> None:
+    frame = np.zeros((height, width, 3), np.uint8)
+    frame[height // 2 : height // 2 + 12, width // 3 : width // 3 + 16] = (255, 0, 0)
+    seen, sizes = np.zeros((height, width), int), set()
+    for (x0, y0, x1, y1), logits in window_logits(frame, red_and_blue):
+        assert logits.shape == (2, 48, 48)
+        assert x1 - x0 == pytest.approx(y1 - y0, rel=0.02)
+        sizes.add(round(x1 - x0, -1))
+        seen[max(0, round(y0)) : round(y1), max(0, round(x0)) : round(x1)] += 1
+        scale = (x1 - x0) / 48
+        middle = np.array([width // 3 + 8, height // 2 + 6])
+        column, row = ((middle - (x0, y0)) / scale).astype(int)
+        if 0 <= row < 48 and 0 <= column < 48:
+            assert logits[0, row, column] > 0, "the square is where the window says"
+    assert seen.min() >= 2 and len(sizes) == (2 if height == width else 3)
 
 
 def test_chain_prefers_what_stays() -> None:
@@ -130,15 +156,34 @@ def test_chain_prefers_what_stays() -> None:
 
 def test_prior_finds_what_the_network_sees() -> None:
     frames, masks = moving_square()
-    prior = object_prior(frames, RedFinder())
+    prior = object_priors(frames, red_and_blue, {"red": 0})["red"]
     assert prior.dtype == np.uint8 and prior.shape == masks.shape
     both = ((prior > 127) & (masks > 0)).sum((1, 2)) / ((prior > 127) | (masks > 0)).sum((1, 2))
     assert both.min() > 0.85
-    boxes = object_boxes(frames, RedFinder())
-    assert boxes is not None
+    boxes = refined_boxes(frames, searched_boxes(frames, red_and_blue, (0,))[0], red_and_blue, 0)
     np.testing.assert_allclose(boxes[4], [52, 30, 92, 60], atol=4)
     nothing = np.zeros_like(frames)
-    assert object_boxes(nothing, RedFinder()) is None and not object_prior(nothing, RedFinder()).any()
+    assert not searched_boxes(nothing, red_and_blue, (0,))
+    assert not object_priors(nothing, red_and_blue, {"red": 0})["red"].any()
+
+
+def test_a_category_seen_much_worse_is_not_looked_at_again() -> None:
+    frames, _ = moving_square()
+    frames = frames.copy()
+    frames[:, 70:, 8:40] = (0, 0, 255)
+    asked = []
+
+    def counting(images: np.ndarray) -> np.ndarray:
+        asked.append(len(images))
+        return red_and_blue(images)
+
+    assert set(object_priors(frames, counting, {"blue": 1})) == {"blue"}, "alone it is all there is"
+    alone = sum(asked)
+    asked.clear()
+    both = {"red": 0, "blue": 1}
+    surest = object_priors(frames, lambda x: counting(x) * np.array([1, 0.9])[:, None, None], both)
+    assert set(surest) == {"red"} and surest["red"].any()
+    assert sum(asked) < 1.5 * alone
 
 
 def test_paste_puts_a_crop_back() -> None:

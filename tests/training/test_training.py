@@ -15,7 +15,7 @@ from synthetic.bank import NOTHING, PARTS, SIDE_PX, Shard, random_body, render_v
 from synthetic.bank import main as write_bank
 from synthetic.canonical import Carrier, canonical_body
 from training.dressing import dress
-from training.export import export
+from training.export import export, shared_of
 from training.losses import (
     Surface,
     imperfect,
@@ -159,11 +159,12 @@ def test_a_short_training_repeats_learns_and_is_written_as_onnx(
     (tmp_path / "a" / "log.jsonl").write_text(json.dumps({"step": 3, "pictures": 24}) + "\n", encoding="utf-8")
     digests = export(tmp_path / "a" / "state.safetensors", tmp_path / "out", {"made_by": "a test"})
     kinds = [f"{kind}-{name}.onnx" for kind in ("cse", "posenet") for name in CATEGORIES]
-    assert set(digests) == {*kinds, *(f"{name}.npz" for name in CATEGORIES), "trunk.onnx"}
+    assert set(digests) == {*kinds, *(f"{name}.npz" for name in CATEGORIES), "trunk.onnx", "finder.onnx"}
     network = Network().eval()
     network.load_state_dict(read_state(tmp_path / "a" / "state.safetensors")["network"])
     x = torch.randn(2, 4, INPUT_PX, INPUT_PX, generator=torch.Generator().manual_seed(0))
     wide = torch.randn(1, 3, 64, 128, generator=torch.Generator().manual_seed(1))
+    finder = onnxruntime.InferenceSession((tmp_path / "out" / "finder.onnx").read_bytes())
     with torch.no_grad():
         out, alone = network(x), network(torch.cat([wide, torch.zeros(1, 1, 64, 128)], 1))
         for k, name in enumerate(CATEGORIES):
@@ -179,3 +180,6 @@ def test_a_short_training_repeats_learns_and_is_written_as_onnx(
             np.testing.assert_allclose(dense[:, 1:], torch.nn.functional.normalize(larger, dim=1), atol=0.02)
             session = onnxruntime.InferenceSession((tmp_path / "out" / f"cse-{name}.onnx").read_bytes())
             np.testing.assert_allclose(session.run(None, {"image": wide.numpy()})[0][:, 0], alone["mask"][:, k], **near)
+        np.testing.assert_allclose(finder.run(None, {"image": wide.numpy()})[0], alone["mask"], **near)
+    again = shared_of(tmp_path / "out" / "posenet-human.onnx", tmp_path / "shared")
+    assert again == {name: digests[name] for name in again} and set(again) == {"trunk.onnx", "finder.onnx"}
