@@ -64,8 +64,9 @@ def background_flow(
     for step in range(10):
         weighted = a * weight[:, None]
         coefficients = np.linalg.solve(weighted.T @ a + 1e-4 * np.eye(a.shape[1]), weighted.T @ b)
-        error = np.linalg.norm(b - a @ coefficients, axis=1)
-        scatter = max(1.48 * float(np.median(error[sure])), 0.1)
+        left = b - a @ coefficients
+        error = np.hypot(left[:, 0], left[:, 1])
+        scatter = max(1.48 * upper_median(error[sure]), 0.1)
         weight = prior / (1.0 + (error / (scatter * (3.0 if step < 4 else 1.5))) ** 2) ** 2
     return (basis @ coefficients.astype(np.float32)).reshape(height, width, 2), scatter
 
@@ -144,17 +145,25 @@ def _compare(
     """Moving vote and colour evidence of one frame against another."""
     height, width = flow.shape[:2]
     fitted, scatter = background_flow(flow, trust, basis)
-    squared = np.einsum("hwc,hwc->hw", flow - fitted, flow - fitted)
+    left = flow - fitted
+    squared = np.einsum("hwc,hwc->hw", left, left)
     vote = squared / (squared + (2.5 * scatter + 0.4) ** 2)
     background = bend_to_surroundings(fitted, flow, np.clip(1 - 2 * vote, 0, 1))
-    apart = np.linalg.norm(flow - background, axis=-1)
+    beside = flow - background
+    apart = np.hypot(beside[..., 0], beside[..., 1])
     as_background = envelope_error(here, sample(there, background, grid))
     as_flow = envelope_error(here, sample(there, flow, grid))
-    noise = max(1.48 * float(np.median(as_flow)), 1.0)
+    noise = max(1.48 * upper_median(as_flow), 1.0)
     ratio = np.clip((as_background**2 - as_flow**2) / (2 * noise**2), -EVIDENCE_LIMIT, EVIDENCE_LIMIT)
     at = grid + background
     inside = (at[..., 0] >= 0) & (at[..., 0] <= width - 1) & (at[..., 1] >= 0) & (at[..., 1] <= height - 1)
     return vote, np.where(inside, ratio * np.clip(apart - 0.5, 0, 1), 0.0).astype(np.float32)
+
+
+def upper_median(values: np.ndarray) -> float:
+    """The median, the upper of the two in the middle of an even number: half the time of numpy's."""
+    middle = values.size // 2
+    return float(np.partition(values, middle, axis=None)[middle])
 
 
 def to_lab(image: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ CLASSIFIER_SHARE = 2.0
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
 _FIT_FRAMES = 48
+_ONE_PIXEL_IN = 4  # of a frame is learnt from: its neighbours look the same
 _ROUNDS = 2
 _STEPS, _PIXELS = 240, 2048
 _BATCH = 8
@@ -171,13 +172,15 @@ def _fitted(seen: Looks, soft: np.ndarray, seed: int, again: bool = False) -> Pi
     chosen = good[np.unique(np.linspace(0, len(good) - 1, min(_FIT_FRAMES, len(good))).round().astype(int))]
     if len(chosen) == 0:
         return None
-    values = np.stack([seen.of(t) for t in chosen])
-    inside = soft[chosen] > 0.5
-    away = np.stack([np.abs(signed_distance(m)) > _RIM_PX for m in inside])
-    weight = away * trust[chosen, None, None].astype(np.float32)
+    draw = np.random.default_rng(seed)
+    pixels = [draw.permutation(soft[0].size)[: soft[0].size // _ONE_PIXEL_IN] for _ in chosen]
+    values = np.concatenate([seen.of(t).reshape(soft[0].size, -1)[p] for t, p in zip(chosen, pixels, strict=True)])
+    inside = np.concatenate([soft[t].ravel()[p] > 0.5 for t, p in zip(chosen, pixels, strict=True)])
+    depth = [np.abs(signed_distance(soft[t] > 0.5)).ravel()[p] for t, p in zip(chosen, pixels, strict=True)]
+    weight = np.concatenate([(d > _RIM_PX) * np.float32(trust[t]) for t, d in zip(chosen, depth, strict=True)])
     for turn in range(1 + again):
         classifier = PixelColours(values.shape[-1], seed + turn)
-        if not classifier.fit(values, inside.astype(np.float32), weight, steps=_STEPS, batch=_PIXELS):
+        if not classifier.fit(values, inside, weight, steps=_STEPS, batch=_PIXELS):
             return None
         if again and turn == 0:
             logit = classifier.logit(values)
