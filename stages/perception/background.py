@@ -19,6 +19,8 @@ from stages.perception.optical_flow import Matcher, pixel_grid, sample
 
 STEPS = (1, 3, 6)
 """Frames before and after that each frame is compared with."""
+SETTLED_PX = 0.02
+"""The background's flow is found when another step changes it nowhere by more."""
 EVIDENCE_LIMIT = 3.0
 """Largest log-likelihood ratio one comparison may give a pixel."""
 
@@ -61,12 +63,16 @@ def background_flow(
     sure = prior >= np.quantile(prior, 0.5)
     weight, scatter = prior, 1.0
     coefficients: np.ndarray = np.zeros((a.shape[1], 2))
+    fitted = np.zeros_like(b)
     for step in range(10):
         weighted = a * weight[:, None]
         coefficients = np.linalg.solve(weighted.T @ a + 1e-4 * np.eye(a.shape[1]), weighted.T @ b)
-        left = b - a @ coefficients
+        before, fitted = fitted, a @ coefficients
+        left = b - fitted
         error = np.hypot(left[:, 0], left[:, 1])
         scatter = max(1.48 * upper_median(error[sure]), 0.1)
+        if step > 4 and np.abs(fitted - before).max() < SETTLED_PX:
+            break
         weight = prior / (1.0 + (error / (scatter * (3.0 if step < 4 else 1.5))) ** 2) ** 2
     return (basis @ coefficients.astype(np.float32)).reshape(height, width, 2), scatter
 

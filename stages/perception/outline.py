@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from stages.perception.background import to_lab
-from stages.perception.temporal import signed_distance
+from stages.perception.temporal import mask_box, signed_distance
 
 _LAB_SCALE = np.array([2.55, 1.0, 1.0], np.float32)
 """Lightness shows an outline better than hue, and survives compression."""
@@ -24,6 +24,26 @@ def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float =
     apart there, and is added to the log-odds of `probability` (H, W) in 0..1 of the 8-bit RGB `image` (H, W, 3).
     What is certain, 0 or 1, and not near the outline, stays so: a fit takes these values as the opacity that it wants.
     """
+    prior = np.log((probability + _PRIOR_LEAST) / (1 + _PRIOR_LEAST - probability))
+    odds = _PRIOR_SHARE * prior
+    part = _surroundings(probability > 0.5, reach_px)
+    odds[part] += 2.0 * _looks(probability[part], image[part], reach_px)
+    found = 1.0 / (1.0 + np.exp(-odds))
+    certain = 1.0 / (1.0 + ((1 + _PRIOR_LEAST) / _PRIOR_LEAST) ** _PRIOR_SHARE)  # what a probability of 0 has become
+    return np.clip((found - certain) / (1 - 2 * certain), 0.0, 1.0).astype(np.float32)
+
+
+def _surroundings(mask: np.ndarray, reach_px: float) -> tuple[slice, slice]:
+    """The part of a picture in which colours can move the outline of a mask (H, W); empty if it has none."""
+    x0, y0, x1, y1 = (int(v) for v in mask_box(mask))
+    margin = int(6 * reach_px) + 1 if x1 > x0 else 0
+    return slice(max(0, y0 - margin), y1 + margin), slice(max(0, x0 - margin), x1 + margin)
+
+
+def _looks(probability: np.ndarray, image: np.ndarray, reach_px: float) -> np.ndarray:
+    """(H, W) log-odds by how far each pixel's colour is from those just outside to those just inside; 0 far from both."""
+    if probability.size == 0:
+        return np.zeros(probability.shape, np.float32)
     rim_px = 0.375 * reach_px
     depth = signed_distance(probability > 0.5)
     lab = to_lab(image) * _LAB_SCALE
@@ -34,11 +54,7 @@ def settle_outline(probability: np.ndarray, image: np.ndarray, reach_px: float =
     length = np.square(line).sum(-1)
     share = ((lab - back) * line).sum(-1) / np.maximum(length, 1.0)
     apart = np.clip(np.sqrt(length) / (front_spread + back_spread + _NOISE_LAB) - 0.7, 0.0, 2.0)
-    looks = np.clip(4.0 * (share - 0.5), -3.0, 3.0) * apart * (front_known & back_known)
-    prior = np.log((probability + _PRIOR_LEAST) / (1 + _PRIOR_LEAST - probability))
-    found = 1.0 / (1.0 + np.exp(-(_PRIOR_SHARE * prior + 2.0 * looks)))
-    certain = 1.0 / (1.0 + ((1 + _PRIOR_LEAST) / _PRIOR_LEAST) ** _PRIOR_SHARE)  # what a probability of 0 has become
-    return np.clip((found - certain) / (1 - 2 * certain), 0.0, 1.0).astype(np.float32)
+    return np.clip(4.0 * (share - 0.5), -3.0, 3.0) * apart * (front_known & back_known)
 
 
 def _local_colours(lab: np.ndarray, chosen: np.ndarray, sigma_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

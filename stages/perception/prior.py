@@ -21,6 +21,8 @@ CROP_MARGIN = 1.35
 """Side of the crop that is segmented over the longer side of the box."""
 SEARCH_EVERY = 4
 """Frames between those that are searched with windows."""
+JUDGED_EVERY, REFINED_EVERY = 8, 2
+"""Frames between those that say which category it may be, and those whose box is made exact."""
 LEAST_SHRINK = 0.8
 """A refined box is never smaller than this share of the box before: refinement tends to fall onto a part."""
 PART_PRICE = 0.2
@@ -59,7 +61,7 @@ def object_priors(frames: np.ndarray, network: FindingNetwork, categories: dict[
     nothing of the category was found in any frame; a category that is seen much worse than another is left out.
     """
     boxes = searched_boxes(frames, network, tuple(categories.values()))
-    sure = {k: _certainty(frames[::SEARCH_EVERY], b[::SEARCH_EVERY], network, k) for k, b in boxes.items()}
+    sure = {k: _certainty(frames[::JUDGED_EVERY], b[::JUDGED_EVERY], network, k) for k, b in boxes.items()}
     least = LEAST_SURE * max(sure.values(), default=0.0)
     out = {}
     for name, channel in categories.items():
@@ -88,12 +90,15 @@ def searched_boxes(frames: np.ndarray, network: FindingNetwork, channels: tuple[
 def refined_boxes(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> np.ndarray:
     """(T, 4) boxes round what the network sees on crops round the boxes before."""
     height, width = frames.shape[1:3]
-    refined = boxes.copy()
-    for i, crop, probability in _looked_at(frames, boxes, network, channel):
+    some = np.unique(np.append(np.arange(0, len(frames), REFINED_EVERY), len(frames) - 1))
+    refined = boxes[some].copy()
+    for i, crop, probability in _looked_at(frames[some], boxes[some], network, channel):
         new = _box_of(probability, crop)
         if new is not None:
-            refined[i] = _not_much_smaller(new, boxes[i])
-    return np.clip(_steady(refined), 0, [width, height, width, height])
+            refined[i] = _not_much_smaller(new, boxes[some[i]])
+    steady = _steady(refined)
+    between = np.stack([np.interp(np.arange(len(frames)), some, side) for side in steady.T], 1)
+    return np.clip(between, 0, [width, height, width, height])
 
 
 def _object_prior(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> np.ndarray:
@@ -292,7 +297,7 @@ def _not_much_smaller(new: np.ndarray, old: np.ndarray) -> np.ndarray:
     return np.concatenate([centre - size / 2, centre + size / 2])
 
 
-def _steady(boxes: np.ndarray, reach: int = 2) -> np.ndarray:
+def _steady(boxes: np.ndarray, reach: int = 1) -> np.ndarray:
     """Median of each box with its neighbours in time."""
     padded = np.pad(boxes, ((reach, reach), (0, 0)), mode="edge")
     return np.asarray(np.median(np.stack([padded[k : k + len(boxes)] for k in range(2 * reach + 1)]), axis=0))

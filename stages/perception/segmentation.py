@@ -32,6 +32,7 @@ from stages.perception.refining import RefiningNetwork, refine
 from stages.perception.temporal import disc, flow_median, main_component, resize_maps, signed_distance
 
 WORK_SIDE_PX = 256
+COARSE_PIXELS = 2048  # learnt from at once
 BLENDED_SHARE = 0.9  # of the object's pixels when plain colours are learnt; see PixelColours.fit
 MOTION_SIDE_PX = 192  # motion tells no more at 256, at five times the work
 CARRY_SIDE_PX = 128
@@ -180,7 +181,7 @@ def coarse_probability(
     soft = seed.astype(np.float32)
     for turn in range(effort.rounds):
         colours = PixelColours(values.shape[-1], effort.seed + turn)
-        if not colours.fit(values, label, weight):
+        if not colours.fit(values, label, weight, batch=COARSE_PIXELS):
             break
         looks = np.stack([cv2.GaussianBlur(x, (0, 0), 0.6) for x in colours.logit(values)])
         place = 1.5 * np.log(np.clip(3 * near, 0.03, 1))
