@@ -19,7 +19,7 @@ LOGIT_LIMIT = 6.0
 RATE = 1.5e-2
 HIDDEN = (48, 32)
 _DECAY, _MEMORY, _TINY = 1e-2, (0.9, 0.999), 1e-8  # AdamW's usual ones
-_AT_ONCE = 1 << 15  # pixels whose values are kept in the cache
+_AT_ONCE = 1 << 13  # pixels whose values are kept in the cache
 
 
 class PixelColours:

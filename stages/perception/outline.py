@@ -41,7 +41,7 @@ def _surroundings(mask: np.ndarray, reach_px: float) -> tuple[slice, slice]:
 
 
 def _looks(probability: np.ndarray, image: np.ndarray, reach_px: float) -> np.ndarray:
-    """(H, W) log-odds by how far each pixel's colour is from those just outside to those just inside; 0 far from both."""
+    """(H, W) log-odds by where each colour is between those just outside and just inside; 0 far from both."""
     if probability.size == 0:
         return np.zeros(probability.shape, np.float32)
     rim_px = 0.375 * reach_px
