@@ -79,11 +79,13 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
         provider = "builtin"
         effort = Effort(refinements=settings.refinements, seed=settings.seed)
         images = clip.images()
-        priors = _priors(images, settings.category, run)
+        finder = OwnFinder(device=run.device, threads=run.threads)
+        priors = _priors(images, settings.category, finder, run)
         refiner = OwnRefiner(device=run.device, threads=run.threads)
         trunk = OwnTrunk(device=run.device, threads=run.threads)
         result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner, trunk=trunk)
         run.metric("category_prior", result.prior or "none")
+        run.metric("found_by", finder.name if result.prior else "none")
         run.metric("refined_by", refiner.name if result.refined else "none")
         run.metric("frames_found_again", result.found_again)
         run.metric("found_again_by", trunk.name if result.found_again else "none")
@@ -95,17 +97,14 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     _report(facts, settings, run, clip)
 
 
-def _priors(images: np.ndarray, category: str, run: Run) -> dict[str, np.ndarray]:
+def _priors(images: np.ndarray, category: str, finder: OwnFinder, run: Run) -> dict[str, np.ndarray]:
     """What a network of ours takes for the object, (T, H, W) uint8 a category; of the named one alone if one is."""
     if category not in ("auto", "other", *CATEGORIES):
         known = ", ".join(("auto", *CATEGORIES, "other"))
         raise BadInput(f"masks.category is {category!r}", hint=f"known: {known}")
     wanted = {"auto": CATEGORIES, "other": ()}.get(category, (category,))
-    if not wanted:
-        return {}
-    run.tick(0, 1, label=f"looking for a {' or a '.join(wanted)}")
-    network = OwnFinder(device=run.device, threads=run.threads)
-    return object_priors(images, network, {name: CATEGORIES.index(name) for name in wanted})
+    run.tick(0, 1, label=f"looking for a {' or a '.join(wanted)}" if wanted else "looking")
+    return object_priors(images, finder, {name: CATEGORIES.index(name) for name in wanted})
 
 
 def _ticker(run: Run) -> Callable[[int, int, str], None]:

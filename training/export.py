@@ -240,7 +240,7 @@ def export(state: Path, out: Path, provenance: dict[str, str]) -> dict[str, str]
             ("cse", cse_model(network, k, provenance)),
             ("posenet", posenet_model(network, k, provenance)),
         ):
-            digests[f"{kind}-{name}.onnx"] = _write_model(out / f"{kind}-{name}.onnx", model)
+            digests[f"{kind}-{name}.onnx"] = write_model(out / f"{kind}-{name}.onnx", model)
         body, surface = canonical_body(name), surfaces[k]
         assert isinstance(surface, Surface)
         part = out / f".{name}.npz"
@@ -268,10 +268,11 @@ def shared_of(path: Path, out: Path) -> dict[str, str]:
 
 def _write_shared(network: Network, out: Path, provenance: dict[str, str]) -> dict[str, str]:
     models = {"trunk.onnx": trunk_model(network, provenance), "finder.onnx": finder_model(network, provenance)}
-    return {name: _write_model(out / name, model) for name, model in models.items()}
+    return {name: write_model(out / name, model) for name, model in models.items()}
 
 
-def _write_model(path: Path, model: onnx.ModelProto) -> str:
+def write_model(path: Path, model: onnx.ModelProto) -> str:
+    """Write a model in one piece; returns its sha256."""
     return _write(path, model.SerializeToString(deterministic=True))
 
 
@@ -293,7 +294,7 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if state.suffix == ".onnx":
-        _log(shared_of(state, out))
+        log_digests(shared_of(state, out))
         return
     refining = state.stem == "refine"
     lines = (state.parent / ("refine.jsonl" if refining else "log.jsonl")).read_text(encoding="utf-8").splitlines()
@@ -308,13 +309,14 @@ def main(state: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro
     if refining:
         out.mkdir(parents=True, exist_ok=True)
         model = refiner_model(averaged_refiner(state), provenance)
-        written = {"refine.onnx": _write_model(out / "refine.onnx", model)}
+        written = {"refine.onnx": write_model(out / "refine.onnx", model)}
     else:
         written = export(state, out, provenance)
-    _log(written)
+    log_digests(written)
 
 
-def _log(written: dict[str, str]) -> None:
+def log_digests(written: dict[str, str]) -> None:
+    """Say what was written: sha256 and name of each file."""
     for name, digest in written.items():
         log.info("%s  %s", digest, name)
 

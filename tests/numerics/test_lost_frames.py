@@ -177,6 +177,6 @@ def test_the_shipped_trunk_gives_features_of_any_size() -> None:
     rng = np.random.default_rng(0)
     frames = [rng.integers(0, 255, (50, 90, 3)).astype(np.uint8) for _ in range(3)]
     features = trunk_features(frames, OwnTrunk())
-    assert features.shape == (3, 6, 12, 64) and features.dtype == np.float32
+    assert features.shape == (3, 10, 16, 64) and features.dtype == np.float16
     assert np.isfinite(features).all() and features.std() > 0.01
-    np.testing.assert_allclose(trunk_features(frames[1:2], OwnTrunk())[0], features[1], atol=1e-4)
+    np.testing.assert_allclose(trunk_features(frames[1:2], OwnTrunk())[0], features[1], atol=1e-2)

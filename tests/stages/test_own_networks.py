@@ -16,13 +16,14 @@ from stages.own_networks import (
     OwnFinder,
     OwnNetwork,
     OwnRefiner,
+    OwnTrunk,
     WeightsDamaged,
     canonical_surface,
 )
 from stages.perception.category import choose_category
 from stages.perception.prior import object_priors
 from stages.perception.refining import refine
-from stages.perception.viewpoint import AZIMUTH_DEG, angle_log_probabilities
+from stages.perception.viewpoint import AZIMUTH_DEG, angle_log_probabilities, normalised
 from stages.registration.placing import ray_rotation, view_angles
 from synthetic.clips import Film, film, make_subject
 from tests.stages.perception_clips import moving_clip, overlap
@@ -51,11 +52,12 @@ def test_files_are_small_and_as_described(category: str) -> None:
 
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_the_finder_sees_what_each_category_s_network_does(category: str) -> None:
-    assert (WEIGHTS / OwnFinder.name).stat().st_size <= 8_000_000
     crops = np.random.default_rng(0).normal(size=(2, 4, 96, 96)).astype(np.float32)
     crops[:, 3] = 0
     dense = OwnNetwork(category)(crops)["dense"][:, 0]
-    np.testing.assert_allclose(OwnFinder()(crops[:, :3])[:, CATEGORIES.index(category)], dense, atol=1e-4)
+    whole = onnxruntime.InferenceSession((WEIGHTS / "finder.onnx").read_bytes())
+    exact = whole.run(["masks"], {"image": crops[:, :3]})[0][:, CATEGORIES.index(category)]
+    np.testing.assert_allclose(exact, dense, atol=1e-4)
     assert OwnFinder()(np.zeros((1, 3, 64, 128), np.float32)).shape == (1, len(CATEGORIES), 32, 64)
 
 
@@ -75,8 +77,24 @@ def test_a_vertex_is_nearest_to_itself(category: str) -> None:
     assert alike.mean() < 0.9 * neighbour.mean()
 
 
+def test_networks_in_integers_say_what_the_exact_ones_do(clip: Film) -> None:
+    """On a processor the former run, on a GPU the latter."""
+    pictures = np.stack([normalised(x) for x in clip.images[:3]])
+    rough = cv2.GaussianBlur(clip.masks[0].astype(np.float32), (0, 0), 3.0)
+    masked = np.concatenate([pictures[:1], rough[None, None]], 1)
+    for network, given in ((OwnFinder(), pictures), (OwnTrunk(), pictures), (OwnRefiner(), masked)):
+        assert network.name.endswith("-int8.onnx") and (WEIGHTS / network.name).stat().st_size <= 4_000_000
+        whole = WEIGHTS / network.name.replace("-int8", "")
+        assert whole.stat().st_size <= 8_000_000
+        session = onnxruntime.InferenceSession(whole.read_bytes())
+        (exact,) = session.run(None, {session.get_inputs()[0].name: given})
+        found = network(given).reshape(exact.shape)
+        assert np.corrcoef(found.ravel(), exact.ravel())[0, 1] > 0.998
+        if network.name.startswith("refine"):
+            assert ((found > 0) == (exact > 0)).mean() > 0.995
+
+
 def test_the_refiner_mends_what_a_rough_mask_lost(clip: Film) -> None:
-    assert (WEIGHTS / OwnRefiner.name).stat().st_size <= 8_000_000
     truth = clip.masks > 0.5
     rough = clip.masks.astype(np.float32).copy()
     for t, mask in enumerate(truth):

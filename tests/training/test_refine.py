@@ -15,8 +15,9 @@ from synthetic.backgrounds import backgrounds
 from synthetic.bank import main as write_bank
 from training.corruption import corrupted
 from training.dressing import _hidden, dress
-from training.export import posenet_model, refiner_model, shared_of
+from training.export import posenet_model, refiner_model, shared_of, trunk_model
 from training.network import CATEGORIES, Network
+from training.quantise import main as quantise
 from training.refine import (
     Refiner,
     averaged_refiner,
@@ -197,3 +198,22 @@ def test_the_trunk_cut_from_an_exported_network_sees_what_the_network_saw(tmp_pa
     with pytest.raises(ValueError, match="does not begin with"):
         whole.write_bytes(onnx.ModelProto().SerializeToString())
         shared_of(whole, tmp_path)
+
+
+def test_networks_in_integers_say_what_they_did(tmp_path: Path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(4)
+        network, refiner = Network().eval(), Refiner().eval()
+    (tmp_path / "trunk.onnx").write_bytes(trunk_model(network, {"made_by": "a test"}).SerializeToString())
+    (tmp_path / "refine.onnx").write_bytes(refiner_model(refiner, {"made_by": "a test"}).SerializeToString())
+    quantise(tmp_path)
+    assert {p.name for p in tmp_path.glob("*int8*")} == {"trunk-int8.onnx", "refine-int8.onnx"}
+    for name, channels in (("trunk", 3), ("refine", 4)):
+        whole, eight = tmp_path / f"{name}.onnx", tmp_path / f"{name}-int8.onnx"
+        assert eight.stat().st_size < 0.6 * whole.stat().st_size
+        said = {p.key: p.value for p in onnx.load(eight).metadata_props}
+        assert said == {"made_by": "a test", "quantised_by": "python -m training.quantise"}
+        sessions = [onnxruntime.InferenceSession(path) for path in (whole, eight)]
+        given = {sessions[0].get_inputs()[0].name: torch.rand(1, channels, 64, 80).numpy()}
+        exact, found = (s.run(None, given)[0].ravel() for s in sessions)
+        assert np.corrcoef(exact, found)[0, 1] > 0.99
