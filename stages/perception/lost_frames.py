@@ -149,7 +149,7 @@ def largest_piece(masks: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:
-    """(T, h, w, C) float16 of frames (H, W, 3) uint8 RGB, h by w about 3/16 of that: the network sees them larger."""
+    """(T, h, w, C) float16 of frames (H, W, 3) uint8 RGB, h by w about 3/16 of it: the network sees them larger."""
     height, width = (max(_MULTIPLE, round(ENLARGED * n / _MULTIPLE) * _MULTIPLE) for n in work[0].shape[:2])
     out = []
     for first in range(0, len(work), _BATCH):
