@@ -121,6 +121,7 @@ train-networks: $(STAMP)  ## train the shipped networks anew: renderings, MINUTE
 	$(PYTHON) -m synthetic.bank build/bank192 --category thing --bodies 20 --views 30 --seed 11 --side-px 192
 	$(PYTHON) -m training.refine build/networks --bank build/bank192 --start build/networks/state.safetensors --seed 0
 	$(PYTHON) -m training.export build/networks/refine.safetensors build/networks/weights
+	$(PYTHON) -m training.quantise build/networks/weights
 
 docs: $(STAMP)  ## write the settings template and the settings page from the code
 	$(PYTHON) docs/generate.py

@@ -33,8 +33,8 @@ for a while looks like the rest of the body."""
 CLASSIFIER_SHARE = 2.0
 """How much the classifier's log-odds count in the second look, beside the refined mask's own."""
 ENLARGED = 1.5
-"""So much larger than the frames are the pictures whose features count: at 1 tails are lost that are found like this, at
-2 some background is found."""
+"""So much larger than the frames are the pictures whose features count: at 1 tails are lost that are found like this,
+at 2 some background is found."""
 _AREA_REACH = 8  # frames to each side that say how large the object usually is
 _RIM_PX = 1.5  # beside the rough outline nothing is learnt
 _FIT_FRAMES = 48
