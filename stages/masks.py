@@ -33,6 +33,7 @@ from stages.formats import (
 from stages.networks import NO_FILE, PromptedMaskNetwork, mask_network
 from stages.own_networks import CATEGORIES, OwnFinder, OwnRefiner, OwnTrunk
 from stages.perception.background import shrink
+from stages.perception.category import OTHER
 from stages.perception.optical_flow import Matcher, sample
 from stages.perception.prior import object_priors
 from stages.perception.prompts import Prompt, prompts_of
@@ -53,7 +54,8 @@ class MaskSettings:
     category: str = "auto"
     """quadruped or human: a network of ours that knows it helps; other: none does; auto: whichever fits what moves."""
     refinements: int = 1
-    """How often a network of ours goes over the rough mask of a quadruped or a person; 0 leaves it rough."""
+    """How often a network of ours goes over the rough mask of a quadruped or a person (once more where it is in doubt);
+    0 leaves it rough."""
     seed: int = 0
     """Seed of the built-in segmentation."""
     network: InputFile = NO_FILE
@@ -77,18 +79,20 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        effort = Effort(refinements=settings.refinements, seed=settings.seed)
+        effort = Effort(refinements=settings.refinements, seed=settings.seed % 2**32)
         images = clip.images()
-        finder = OwnFinder(device=run.device, threads=run.threads)
-        priors = _priors(images, settings.category, finder, run)
-        refiner = OwnRefiner(device=run.device, threads=run.threads)
-        trunk = OwnTrunk(device=run.device, threads=run.threads)
+        networks = _own_networks(settings.category, run)
+        priors, refiner, trunk = {}, None, None
+        if networks is not None:
+            finder, refiner, trunk = networks
+            priors = _priors(images, settings.category, finder, run)
         result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner, trunk=trunk)
+        found_again = result.found_again or result.looked_again
         run.metric("category_prior", result.prior or "none")
-        run.metric("found_by", finder.name if result.prior else "none")
-        run.metric("refined_by", refiner.name if result.refined else "none")
+        run.metric("found_by", OwnFinder.name if result.prior else "none")
+        run.metric("refined_by", OwnRefiner.name if result.refined else "none")
         run.metric("frames_found_again", result.found_again)
-        run.metric("found_again_by", trunk.name if result.found_again else "none")
+        run.metric("found_again_by", OwnTrunk.name if found_again else "none")
         run.metric("frames_with_pieces_added", result.with_pieces)
     for name, mask in zip(clip.names, result.probability, strict=True):
         write_image(out / name, mask)
@@ -97,13 +101,20 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     _report(facts, settings, run, clip)
 
 
+def _own_networks(category: str, run: Run) -> tuple[OwnFinder, OwnRefiner, OwnTrunk] | None:
+    """Our networks; None where the settings say that the object is of no category."""
+    if category not in ("auto", OTHER, *CATEGORIES):
+        known = ", ".join(("auto", *CATEGORIES, OTHER))
+        raise BadInput(f"masks.category is {category!r}", hint=f"known: {known}")
+    if category == OTHER:
+        return None
+    return OwnFinder(threads=run.threads), OwnRefiner(threads=run.threads), OwnTrunk(threads=run.threads)
+
+
 def _priors(images: np.ndarray, category: str, finder: OwnFinder, run: Run) -> dict[str, np.ndarray]:
     """What a network of ours takes for the object, (T, H, W) uint8 a category; of the named one alone if one is."""
-    if category not in ("auto", "other", *CATEGORIES):
-        known = ", ".join(("auto", *CATEGORIES, "other"))
-        raise BadInput(f"masks.category is {category!r}", hint=f"known: {known}")
-    wanted = {"auto": CATEGORIES, "other": ()}.get(category, (category,))
-    run.tick(0, 1, label=f"looking for a {' or a '.join(wanted)}" if wanted else "looking")
+    wanted = CATEGORIES if category == "auto" else (category,)
+    run.tick(0, 1, label=f"looking for a {' or a '.join(wanted)}")
     return object_priors(images, finder, {name: CATEGORIES.index(name) for name in wanted})
 
 
@@ -215,7 +226,7 @@ def _from_network(clip: Clip, given: Given, settings: MaskSettings, run: Run) ->
 def _prompts(clip: Clip, given: Given, settings: MaskSettings, run: Run) -> list[Prompt]:
     """Where to look in each frame: the user's hints, and the built-in segmentation that they steer."""
     hints = read_hints(given.get(".hints.toml"), clip)
-    rough = segment(clip.images(), hints, Effort(seed=settings.seed), tick=_ticker(run))
+    rough = segment(clip.images(), hints, Effort(seed=settings.seed % 2**32), tick=_ticker(run))
     return prompts_of(rough.probability > 127, hints)
 
 

@@ -6,13 +6,6 @@ from pathlib import Path
 
 import onnxruntime
 
-_CUDA = "CUDAExecutionProvider"
-
-
-def runs_on(device: str) -> str:
-    """What a network that is asked for on `device` runs on: "cuda" where that is wanted and can be had, else "cpu"."""
-    return "cuda" if device == "cuda" and _CUDA in onnxruntime.get_available_providers() else "cpu"
-
 
 def open_session(network: Path | bytes, device: str, threads: int) -> onnxruntime.InferenceSession:
     """A session of a file or of its bytes, on `device` ("cuda" or "cpu"); onnxruntime's own errors pass through.
@@ -25,8 +18,7 @@ def open_session(network: Path | bytes, device: str, threads: int) -> onnxruntim
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    providers = ["CPUExecutionProvider"]
-    if runs_on(device) == "cuda":
-        providers.insert(0, _CUDA)
+    wanted = ["CUDAExecutionProvider"] if device == "cuda" else []
+    providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in onnxruntime.get_available_providers()]
     source = network if isinstance(network, bytes) else str(network)
     return onnxruntime.InferenceSession(source, options, providers=providers)

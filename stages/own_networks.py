@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.onnx_runtime import open_session, runs_on
+from stages.onnx_runtime import open_session
 
 WEIGHTS = Path(__file__).parent / "weights"
 CATEGORIES = ("quadruped", "human")
@@ -17,12 +17,9 @@ DIGESTS = {
     "posenet-human.onnx": "d2e2a25b8e9e82b84e6d616471c5d07078b2b0560cad0e0a6e87df25ce17e866",
     "quadruped.npz": "08131d368bb1b29ac53b50747c55186bab028996b8e0a1b92598f7c03aaa02ed",
     "human.npz": "95b6eebf697fe08a808e36dd866b8130d306c1b612b96f3e7979c2fc18e4e99e",
-    "refine.onnx": "17f7c6e0c7398a56703b091661eea1eee1147bd68a12c0da2697fc367e26d4f2",
-    "finder.onnx": "64fb4b9d91959e290ab55cdc0e1ffe7efb2391deac48346fd59bb1ea831ee9cd",
     "refine-int8.onnx": "5d7d4926aef1b59f2dcf7b0cb8ada7f01713f143a95bdaf3519d87cf5786fc28",
     "finder-int8.onnx": "705a6cd33ea5cca6cf91cd8cdb1483fd7c84bff9bb191610105fddc4b2754abd",
     "trunk-int8.onnx": "76f2bdbe04278e2b25b3b91db130af831653a2df15c4fc2753e004db0a276cf4",
-    "trunk.onnx": "e16cd52a6258a3b27a5a76f7004fa32c17e3b003f5f53462bc86cacae0dd09e3",
     "quadruped-skeleton.npz": "aabfb977e9d3dab9fc71b28930737a8da2837fa47dfe0ac5b703ca83574b950a",
     "human-skeleton.npz": "a2f5140035bcfba243a3ac916b55fa8c415e76c00904a8233e49cd5872d2d111",
 }
@@ -49,19 +46,18 @@ class OwnNetwork:
 
 
 class _OwnFile:
-    """A file of ours, opened: in single precision on a GPU, in 8-bit integers on a processor, three times as fast."""
+    """A file of ours, opened. In 8-bit integers: for processors, on which these networks run."""
 
-    stem: str
+    name: str
 
-    def __init__(self, *, device: str = "cpu", threads: int = 1) -> None:
-        self.name = f"{self.stem}.onnx" if runs_on(device) == "cuda" else f"{self.stem}-int8.onnx"
-        self._session = open_session(_read(self.name), device, threads)
+    def __init__(self, *, threads: int = 1) -> None:
+        self._session = open_session(_read(self.name), "cpu", threads)
 
 
 class OwnRefiner(_OwnFile):
     """The network that makes rough masks exact (see stages.perception.refining.RefiningNetwork)."""
 
-    stem = "refine"
+    name = "refine-int8.onnx"
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """(N, S, S) logits of (N, 4, S, S) float32, S a multiple of 16."""
@@ -72,7 +68,7 @@ class OwnRefiner(_OwnFile):
 class OwnTrunk(_OwnFile):
     """What the categories' networks share (see stages.perception.lost_frames.TrunkNetwork)."""
 
-    stem = "trunk"
+    name = "trunk-int8.onnx"
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """(N, 64, H/8, W/8) features of (N, 3, H, W) float32, H and W multiples of 16."""
@@ -83,7 +79,7 @@ class OwnTrunk(_OwnFile):
 class OwnFinder(_OwnFile):
     """Masks of all categories on pictures of any size (see stages.perception.prior.FindingNetwork)."""
 
-    stem = "finder"
+    name = "finder-int8.onnx"
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
         """(N, len(CATEGORIES), H/2, W/2) logits of (N, 3, H, W) float32, H and W multiples of 16."""

@@ -3,8 +3,8 @@
 ``python -m training.quantise WEIGHTS_DIR``
 
 Beside ``trunk.onnx``, ``finder.onnx`` and ``refine.onnx`` (:mod:`training.export`) it writes ``trunk-int8.onnx`` and so
-on: weights of 7 bits a channel, so that no sum of products overflows on processors without the newer instructions, and
-activations of 8 bits, whose ranges are measured on generated clips.
+on: weights of 7 bits, scaled channel by channel, so that no sum of products overflows on processors without the newer
+instructions, and activations of 8 bits, whose ranges are measured on generated clips.
 """
 
 from __future__ import annotations
@@ -112,6 +112,8 @@ def main(weights: Annotated[Path, tyro.conf.Positional], seed: int = 40) -> None
         if (weights / f"{name}.onnx").exists():
             model = quantised(onnx.load(weights / f"{name}.onnx"), seed)
             written[f"{name}-int8.onnx"] = write_model(weights / f"{name}-int8.onnx", model)
+    if not written:
+        raise FileNotFoundError(f"{weights} holds none of {', '.join(f'{name}.onnx' for name in NETWORKS)}")
     log_digests(written)
 
 

@@ -1,8 +1,8 @@
-"""Frames in which colours and motion lost the object, found again by how it looks to a network in the clip's others.
+"""Frames and parts that masks lost, found again by how the object looks to a network in the clip's other frames.
 
 Fur in the shade of a table has the colours of the floor. What a trained network sees in it (shape, texture, what lies
 around) changes less; so a classifier is fitted, in this very clip, to those features where the rough masks are steady,
-and read where they are not.
+and read where they are not. Refined masks teach it again where they are in doubt, and then it has a say in every frame.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ LEAST_TRUST = 0.75
 """Median overlap over the frames with steady masks below which the classifier has learnt nothing and is left out."""
 LEAST_SIZE = 0.5
 """A find smaller than this share of the object in the steady frames next to it is none: the object may have left."""
-DOUBTED_SHARE = 0.06
-"""A piece of a mask larger than this share of it, about which it and the classifier differ in any frame, asks for a
-second look at refined masks. Where those are right the largest is 0.05 and less, but for a whole clip's worst frame."""
+DOUBTED_SHARE, CHANGED_SHARE = 0.06, 0.03
+"""A piece larger than this share of a mask about which it and the classifier differ, in any frame, asks for a second
+look at all; and one after which a frame counts as changed. Where masks are right, the largest is about 0.05."""
 OVERRULED_LOGIT = 0.5
 """A label that the classifier contradicts by more than this is left out when it is taught again: a tail that masks lack
 for a while looks like the rest of the body."""
@@ -58,13 +58,15 @@ class Found:
     """Masks with lost frames mended.
 
     `probability` (T, h, w) float32 in 0..1; `lost` (T,) bool: which frames were mended; `seen`: what the classifier is
-    shown; `said` (T, h/2, w/2) float32: what it says of every frame, None where the features do not tell the object.
+    shown; `said` (T, h/2, w/2) float32: what it says of every frame, None where the features do not tell the object;
+    `least` (T,): share of the frame that the object covers at least, unless it has left.
     """
 
     probability: np.ndarray
     lost: np.ndarray
     seen: Looks
     said: np.ndarray | None
+    least: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -94,58 +96,68 @@ def find_again(work: list[np.ndarray], soft: np.ndarray, told: np.ndarray, netwo
     small = resize_maps(soft, width, height)
     hints = resize_maps(told, width, height)
     steady = steadiness(small) > 0.5
-    found, agreement = small, np.ones(len(soft))
+    found, agreement, least = None, np.ones(len(soft)), np.zeros(len(soft))
     for turn in range(_ROUNDS):
-        classifier = _fitted(seen, found, seed + 20 + turn)
+        classifier = _fitted(seen, small if found is None else found, seed + 20 + turn)
         if classifier is None:
             break
-        found = _probable(_read(classifier, seen, hints))
+        found = _probable(_read(classifier, seen) + hints)
         agreement = np.array([intersection_over_union(a > 0.5, b > 0.5) for a, b in zip(small, found, strict=True)])
         if (agreement >= LEAST_AGREEMENT).all():
             break
-    if not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
-        return Found(soft, np.zeros(len(soft), bool), seen, None)
-    area, again = ((m > 0.5).reshape(len(m), -1).mean(axis=1) for m in (small, found))
-    expected = np.interp(np.arange(len(soft)), np.flatnonzero(steady), area[steady])
-    lost = (agreement < LEAST_AGREEMENT) & (again > LEAST_SIZE * expected)
+    if found is None or not steady.any() or float(np.median(agreement[steady])) < LEAST_TRUST:
+        return Found(soft, np.zeros(len(soft), bool), seen, None, least)
+    least = LEAST_SIZE * np.interp(np.arange(len(soft)), np.flatnonzero(steady), _area(small)[steady])
+    there = _area(found) > least
+    lost = (agreement < LEAST_AGREEMENT) & there
     mended = soft.copy()
     for t in np.flatnonzero(lost):  # the larger of both: a lost frame lacks pieces, and what it has is mostly right
         mended[t] = np.maximum(soft[t], cv2.resize(found[t], soft.shape[:0:-1], interpolation=cv2.INTER_LINEAR))
-    return Found(mended, lost, seen, found)
+    return Found(mended, lost, seen, found * there[:, None, None], least)
 
 
 def look_again(refined: np.ndarray, told: np.ndarray, seed: int, first: Found) -> tuple[np.ndarray, np.ndarray]:
-    """Refined masks (T, H, W) and the classifier's opinion of them as one, and which frames that changed, (T,) bool.
+    """Refined masks (T, H, W) and the classifier's opinion of them as one; where that changed a whole piece, (T,) bool.
 
     Refining may drop a head in the shade or a tail, in some frames of many. Where a mask and what the `first` look said
     differ by a whole piece, the classifier is taught anew, by the refined masks; what comes of it is rough, and to be
-    refined again. Masks without such a piece come back as they are, and none changed.
+    refined again. Hints, log-odds `told` (T, h, w), count once more. Frames that the object has left stay as they are;
+    so do all masks, the very array, where there is no such piece.
     """
     none = np.zeros(len(refined), bool)
     if first.said is None:
         return refined, none
     height, width = first.said.shape[1:]
     small = resize_maps(refined, width, height)
-    if not (largest_piece(small > 0.5, first.said > 0.5) > DOUBTED_SHARE).any():
+    if not (largest_piece(small > 0.5, first.said > 0.5, first.least) > DOUBTED_SHARE).any():
         return refined, none
     classifier = _fitted(first.seen, small, seed + 40, again=True)
     if classifier is None:
         return refined, none
-    logits = CLASSIFIER_SHARE * _read(classifier, first.seen, resize_maps(told, width, height))
+    logits = CLASSIFIER_SHARE * _read(classifier, first.seen) + resize_maps(told, width, height)
     own = np.log((refined + 0.01) / (1.01 - refined))
     out = _probable(own + resize_maps(logits, refined.shape[2], refined.shape[1]))
-    changed = largest_piece(small > 0.5, resize_maps(out, width, height) > 0.5) > DOUBTED_SHARE / 2
-    return out, changed
+    gone = _area(out) <= first.least
+    out[gone] = refined[gone]
+    return out, largest_piece(small > 0.5, resize_maps(out, width, height) > 0.5, first.least) > CHANGED_SHARE
 
 
-def largest_piece(masks: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(T,) area of the largest thick piece in which boolean masks (T, h, w) differ, as a share of the mask's."""
+def largest_piece(masks: np.ndarray, others: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """(T,) area of the largest thick piece in which boolean masks (T, h, w) differ, as a share of the mask's.
+
+    Of `least` (T,), a share of the frame, where the mask is smaller than that.
+    """
     out = np.zeros(len(masks))
     for t, (mask, other) in enumerate(zip(masks, others, strict=True)):
         thick = cv2.morphologyEx((mask ^ other).astype(np.uint8), cv2.MORPH_OPEN, disc(2))
         areas = cv2.connectedComponentsWithStats(thick, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
-        out[t] = areas.max(initial=0) / max(np.count_nonzero(mask), 1)
+        out[t] = areas.max(initial=0) / max(int(np.count_nonzero(mask)), least[t] * mask.size, 1.0)
     return out
+
+
+def _area(soft: np.ndarray) -> np.ndarray:
+    """(T,) share of the frame that masks (T, h, w) cover."""
+    return np.asarray((soft > 0.5).reshape(len(soft), -1).mean(axis=1))
 
 
 def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:
@@ -160,7 +172,7 @@ def trunk_features(work: list[np.ndarray], network: TrunkNetwork) -> np.ndarray:
 
 def steadiness(soft: np.ndarray) -> np.ndarray:
     """(T,) in 0..1: whether a mask is nearly as large as the larger ones of the frames around it are."""
-    area = (soft > 0.5).reshape(len(soft), -1).mean(axis=1)
+    area = _area(soft)
     usual = [np.quantile(area[max(0, t - _AREA_REACH) : t + _AREA_REACH + 1], 0.75) for t in range(len(area))]
     return np.clip((area / np.maximum(usual, 1e-9) - 0.6) / 0.3, 0.0, 1.0)
 
@@ -191,11 +203,9 @@ def _fitted(seen: Looks, soft: np.ndarray, seed: int, again: bool = False) -> Pi
     return classifier
 
 
-def _read(classifier: PixelColours, seen: Looks, told: np.ndarray) -> np.ndarray:
-    """(T, h, w) log-odds of every frame, those of hints (T, h, w) added."""
-    return np.stack(
-        [cv2.GaussianBlur(classifier.logit(seen.of(t)), (0, 0), 0.6) + told[t] for t in range(len(seen.colours))]
-    )
+def _read(classifier: PixelColours, seen: Looks) -> np.ndarray:
+    """(T, h, w) log-odds of every frame."""
+    return np.stack([cv2.GaussianBlur(classifier.logit(seen.of(t)), (0, 0), 0.6) for t in range(len(seen.colours))])
 
 
 def _probable(logits: np.ndarray) -> np.ndarray:

@@ -30,8 +30,9 @@ PART_PRICE = 0.2
 SMALL_WINDOW = 0.6
 """Side of the smallest windows over the picture's shorter side."""
 LEAST_SURE = 0.5
-"""A category that the searched frames show with less than this share of the surest one's certainty is not looked at
-again."""
+"""A category that some frames show with less than this share of the surest one's certainty is not looked at again."""
+NARROWEST = 1 / 12
+"""Windows smaller than this share of the picture's longer side are not looked at: there would be hundreds."""
 _BATCH = 16
 _MULTIPLE = 16  # of pixels, what the network takes
 _HALF = INPUT_PX // 2
@@ -111,11 +112,12 @@ def _object_prior(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork
 
 
 def _certainty(frames: np.ndarray, boxes: np.ndarray, network: FindingNetwork, channel: int) -> float:
-    """How surely the frames show an object of the category, 0..1: probability on it over all that is not surely off."""
+    """How sure the network is of the object where it sees one, 0..1: probability on it over all that is not surely off.
+
+    Not in how many frames: something that comes into the picture late may be what moves.
+    """
     maps = np.stack([probability for _, _, probability in _looked_at(frames, boxes, network, channel)])
-    inside = maps > 0.5
-    present = float(inside.reshape(len(maps), -1).any(axis=1).mean())
-    return present * float(maps[inside].sum()) / max(np.count_nonzero(maps > 0.2), 1)
+    return float(maps[maps > 0.5].sum()) / max(int(np.count_nonzero(maps > 0.2)), 1)
 
 
 def candidates(
@@ -140,7 +142,7 @@ def candidates(
 def window_logits(frame: np.ndarray, network: FindingNetwork) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Square windows (4,) x0, y0, x1, y1 over a frame (H, W, 3), and the network's logits (K, 48, 48) in each.
 
-    The whole picture, and windows that overlap by half of the shorter side and of 0.6 of it. Windows of one size are
+    The whole picture, and windows of its shorter side and of 0.6 of it, which overlap by half. Windows of one size are
     cut from one pass over the picture.
     """
     height, width = frame.shape[:2]
@@ -149,10 +151,11 @@ def window_logits(frame: np.ndarray, network: FindingNetwork) -> Iterator[tuple[
     whole = np.concatenate([centre - long / 2, centre + long / 2])
     yield whole, network(normalised(crop_resize(frame, whole, INPUT_PX))[None])[0]
     for side in (short, SMALL_WINDOW * short):
-        if side >= long:
+        if not NARROWEST * long < side < long:
             continue
         scale = INPUT_PX / side
-        size = max(INPUT_PX, round(width * scale)), max(INPUT_PX, round(height * scale))
+        # Even, so that the last windows end where the picture does.
+        size = max(INPUT_PX, 2 * round(width * scale / 2)), max(INPUT_PX, 2 * round(height * scale / 2))
         picture = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         padding = [(0, -n % _MULTIPLE) for n in (size[1], size[0])]
         logits = network(normalised(np.pad(picture, [*padding, (0, 0)]))[None])[0]

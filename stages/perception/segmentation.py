@@ -60,7 +60,8 @@ class Segmentation:
     agreement: np.ndarray
     prior: str = ""  # the category whose network had a say
     refined: bool = False  # whether a network went over the rough mask
-    found_again: int = 0  # frames in which colours and motion had lost the object
+    found_again: int = 0  # frames in which the object, or a whole piece of it, was lost or wrong
+    looked_again: bool = False  # whether what was found there had a say in every frame
     with_pieces: int = 0  # frames that gained a piece that looks like the background
 
 
@@ -130,7 +131,7 @@ def segment(
         known = told
     soft = coarse_probability(work, cues, known, carrier, effort)
     tick(1, 2, "learning")
-    lost, found = np.zeros(len(work), bool), None
+    lost, looked_again, found = np.zeros(len(work), bool), False, None
     if trunk is not None and chosen:
         found = find_again(work, soft, told, trunk, effort.seed)
         soft, lost = found.probability, found.lost
@@ -140,7 +141,8 @@ def segment(
         soft = refined_probability(images, soft, told, refiner, effort)
         if found is not None:
             again, changed = look_again(soft, told, effort.seed, found)
-            if again is not soft:
+            looked_again = again is not soft
+            if looked_again:
                 soft = refined_probability(images, again, told, refiner, effort)
             lost = lost | changed
     else:
@@ -152,7 +154,7 @@ def segment(
     )  # fmt: skip
     last = finish(images, soft, carrier)
     return Segmentation(
-        last.probability, last.agreement, chosen, refined, int(lost.sum()), int(np.count_nonzero(gained))
+        last.probability, last.agreement, chosen, refined, int(lost.sum()), looked_again, int(np.count_nonzero(gained))
     )
 
 

@@ -47,6 +47,9 @@ def test_a_quadrupeds_networks_are_found_by_what_the_stages_say() -> None:
     }
     found = _brought_along(STAGES, said)
     assert set(found) == {"posenet-quadruped.onnx"}
+    masks = {"found_by": "finder-int8.onnx", "category_prior": "quadruped", "refined_by": "refine-int8.onnx"}
+    found = _brought_along(STAGES, {"masks/fox": {**masks, "found_again_by": "none"}})
+    assert set(found) == {"finder-int8.onnx", "refine-int8.onnx"}
     followed = _brought_along(STAGES, {"posture": {"limbs": "quadruped"}})
     assert set(followed) == {"quadruped.npz", "quadruped-skeleton.npz"}
     assert all(len(row["sha256"]) == 64 for row in found.values())

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from stages.own_networks import OwnTrunk
+from stages.perception import lost_frames
 from stages.perception.lost_frames import find_again, largest_piece, look_again, steadiness, trunk_features
 from stages.perception.temporal import intersection_over_union
 
@@ -107,9 +109,17 @@ def test_what_is_left_of_an_object_that_has_gone_is_not_the_object() -> None:
         truth[t] = 0
         truth[t, 20:36, 40:56] = 1
         rough[t] = 0.05
-    mended, lost = _found(frames, rough, _Knowing(truth))
-    assert not lost.any()
-    np.testing.assert_array_equal(mended, rough)
+    first = find_again(frames, rough, np.zeros_like(rough), _Knowing(truth), seed=0)
+    assert not first.lost.any() and first.said is not None
+    np.testing.assert_array_equal(first.probability, rough)
+    assert not first.said[list(LOST)].any() and first.said[0].any()
+    refined = _twice_as_large(truth)
+    for t in LOST:
+        refined[t] = 0
+    refined[2, :, : 2 * (26 + 2 * 2)] = 0  # something else is in doubt
+    out, changed = look_again(refined, np.zeros_like(rough), 0, first)
+    assert np.flatnonzero(changed).tolist() == [2]
+    assert not out[list(LOST)].any()
 
 
 def _twice_as_large(masks: np.ndarray) -> np.ndarray:
@@ -125,7 +135,7 @@ def test_a_part_that_refining_dropped_comes_back() -> None:
     assert not first.lost.any() and first.said is not None
     large = _twice_as_large(truth)
     refined = large.copy()
-    dropped = range(6, 14)  # a third of the frames: their labels must not teach that the part is none
+    dropped = range(6, 14)
     for t in dropped:
         refined[t, :, : 2 * (26 + 2 * t)] = 0
     out, changed = look_again(refined, zeros, 0, first)
@@ -134,15 +144,35 @@ def test_a_part_that_refining_dropped_comes_back() -> None:
     assert min(_overlap(a, b) for a, b in zip(out, large, strict=True)) > 0.8
 
 
+def test_what_the_classifier_contradicts_does_not_teach_it_again() -> None:
+    """A fifth of what is called object is background in every frame, and looks like it."""
+    frames, truth, _ = _clip()
+    first = find_again(frames, (0.05 + 0.9 * truth).astype(np.float32), np.zeros_like(truth), _Knowing(truth), seed=0)
+    block = np.stack([cv2.resize(m, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA) for m in truth]) > 0.5
+    wrong = np.zeros_like(block)
+    wrong[:, 26:31, 2:14] = True
+    said = []
+    for again in (False, True):
+        classifier = lost_frames._fitted(first.seen, (block | wrong).astype(np.float32), 3, again=again)
+        assert classifier is not None
+        logit = np.stack([classifier.logit(first.seen.of(t)) for t in range(COUNT)])
+        assert logit[block].mean() > 2
+        said.append(float(logit[wrong].mean()))
+    assert said[1] < said[0] - 0.5
+
+
 def test_a_hint_counts_in_the_second_look() -> None:
     frames, truth, _ = _clip()
     told = np.zeros_like(truth)
     first = find_again(frames, (0.05 + 0.9 * truth).astype(np.float32), told, _Knowing(truth), seed=0)
-    refined = _twice_as_large(truth)
-    refined[11, :, : 2 * (26 + 2 * 11)] = 0
-    told[11] = -20.0
+    large, half = _twice_as_large(truth), 2 * (26 + 2 * 11)
+    refined = large.copy()
+    refined[11, :, :half] = 0
+    assert (look_again(refined, told, 0, first)[0][11, :, : half - 8] > 0.5).any()
+    told[11, :, : half // 2] = -20.0
     out, _ = look_again(refined, told, 0, first)
-    assert not (out[11] > 0.5).any() and _overlap(out[12], _twice_as_large(truth)[12]) > 0.8
+    assert not (out[11, :, : half - 8] > 0.5).any() and _overlap(out[11], refined[11]) > 0.8
+    assert _overlap(out[12], large[12]) > 0.8
 
 
 def test_masks_that_lost_nothing_are_not_looked_at_again() -> None:
@@ -161,10 +191,11 @@ def test_the_largest_piece_in_which_masks_differ() -> None:
     mask[0, 10:30, 10:30] = True
     other = mask.copy()
     other[0, 10:30, 28:30] = False  # a rim, not a piece
-    assert largest_piece(mask, other)[0] == 0
+    assert largest_piece(mask, other, np.zeros(1))[0] == 0
     other[0, 10:20, 10:20] = False
-    assert 0.2 < largest_piece(mask, other)[0] <= 0.25
-    assert largest_piece(np.zeros_like(mask), np.zeros_like(mask))[0] == 0
+    assert 0.2 < largest_piece(mask, other, np.zeros(1))[0] <= 0.25
+    assert largest_piece(np.zeros_like(mask), np.zeros_like(mask), np.zeros(1))[0] == 0
+    assert largest_piece(np.zeros_like(mask), mask, np.array([0.5]))[0] == pytest.approx(0.5, rel=0.05)
 
 
 def test_steadiness_sees_a_mask_that_shrank() -> None:
