@@ -31,7 +31,7 @@ OVERRULED_LOGIT = 0.5
 """A label that the classifier contradicts by more than this is left out when it is taught again: a tail that masks lack
 for a while looks like the rest of the body."""
 CLASSIFIER_SHARE = 2.0
-"""How much the classifier's log-odds count in the second look, beside the refined mask's own."""
+"""How much the classifier's log-odds, and those of hints, count in the second look, beside the refined mask's own."""
 ENLARGED = 1.5
 """So much larger than the frames are the pictures whose features count: at 1 tails are lost that are found like this,
 at 2 some background is found."""
@@ -121,8 +121,8 @@ def look_again(refined: np.ndarray, told: np.ndarray, seed: int, first: Found) -
 
     Refining may drop a head in the shade or a tail, in some frames of many. Where a mask and what the `first` look said
     differ by a whole piece, the classifier is taught anew, by the refined masks; what comes of it is rough, and to be
-    refined again. Hints, log-odds `told` (T, h, w), count once more. Frames that the object has left stay as they are;
-    so do all masks, the very array, where there is no such piece.
+    refined again. Hints, log-odds `told` (T, h, w), count as the classifier does. Frames that the object has left stay as
+    they are; so do all masks, the very array, where there is no such piece.
     """
     none = np.zeros(len(refined), bool)
     if first.said is None:
@@ -134,7 +134,7 @@ def look_again(refined: np.ndarray, told: np.ndarray, seed: int, first: Found) -
     classifier = _fitted(first.seen, small, seed + 40, again=True)
     if classifier is None:
         return refined, none
-    logits = CLASSIFIER_SHARE * _read(classifier, first.seen) + resize_maps(told, width, height)
+    logits = CLASSIFIER_SHARE * (_read(classifier, first.seen) + resize_maps(told, width, height))
     own = np.log((refined + 0.01) / (1.01 - refined))
     out = _probable(own + resize_maps(logits, refined.shape[2], refined.shape[1]))
     gone = _area(out) <= first.least
