@@ -121,8 +121,8 @@ def look_again(refined: np.ndarray, told: np.ndarray, seed: int, first: Found) -
 
     Refining may drop a head in the shade or a tail, in some frames of many. Where a mask and what the `first` look said
     differ by a whole piece, the classifier is taught anew, by the refined masks; what comes of it is rough, and to be
-    refined again. Hints, log-odds `told` (T, h, w), count as the classifier does. Frames that the object has left stay as
-    they are; so do all masks, the very array, where there is no such piece.
+    refined again. Hints, log-odds `told` (T, h, w), count as the classifier does. Frames that the object has left stay
+    as they are; so do all masks, the very array, where there is no such piece.
     """
     none = np.zeros(len(refined), bool)
     if first.said is None:

@@ -29,7 +29,7 @@ PART_PRICE = 0.2
 """What it costs a candidate to lie within a larger one, and brings that one."""
 SMALL_WINDOW = 0.6
 """Side of the smallest windows over the picture's shorter side."""
-LEAST_SURE = 0.5
+LEAST_SURE = 0.75
 """A category that some frames show with less than this share of the surest one's certainty is not looked at again."""
 NARROWEST = 1 / 12
 """Windows smaller than this share of the picture's longer side are not looked at: there would be hundreds."""
