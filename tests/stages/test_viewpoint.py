@@ -203,7 +203,7 @@ def test_what_comes_late_is_looked_at_as_well() -> None:
     frames = np.concatenate([frames] * 3)
     frames[:, 70:, 8:40] = (0, 0, 255)
     frames[: 2 * len(frames) // 3, :69] = 0  # red is there in the last third alone
-    found = object_priors(frames, lambda x: red_and_blue(x) + np.array([0, 2])[:, None, None], {"red": 0, "blue": 1})
+    found = object_priors(frames, lambda x: red_and_blue(x) * np.array([1, 8])[:, None, None], {"red": 0, "blue": 1})
     assert set(found) == {"red", "blue"} and found["red"][-1].any()
 
 
