@@ -79,14 +79,15 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     else:
         hints = read_hints(given.get(".hints.toml"), clip)
         provider = "builtin"
-        effort = Effort(refinements=settings.refinements, seed=settings.seed % 2**32)
         images = clip.images()
         networks = _own_networks(settings.category, run)
         priors, refiner, trunk = {}, None, None
         if networks is not None:
             finder, refiner, trunk = networks
             priors = _priors(images, settings.category, finder, run)
-        result = segment(images, hints, effort, tick=_ticker(run), priors=priors, refiner=refiner, trunk=trunk)
+        result = segment(
+            images, hints, _effort(settings), tick=_ticker(run), priors=priors, refiner=refiner, trunk=trunk
+        )
         found_again = result.found_again or result.looked_again
         run.metric("category_prior", result.prior or "none")
         run.metric("found_by", OwnFinder.name if result.prior else "none")
@@ -99,6 +100,10 @@ def masks(frames: Folder, given: Given, settings: MaskSettings, out: Path, run: 
     facts = _facts(provider, result, clip, settings.threshold)
     write_mask_facts(out, facts, clip)
     _report(facts, settings, run, clip)
+
+
+def _effort(settings: MaskSettings) -> Effort:
+    return Effort(refinements=settings.refinements, seed=settings.seed % 2**32)  # numpy takes no negative seeds
 
 
 def _own_networks(category: str, run: Run) -> tuple[OwnFinder, OwnRefiner, OwnTrunk] | None:
@@ -226,7 +231,7 @@ def _from_network(clip: Clip, given: Given, settings: MaskSettings, run: Run) ->
 def _prompts(clip: Clip, given: Given, settings: MaskSettings, run: Run) -> list[Prompt]:
     """Where to look in each frame: the user's hints, and the built-in segmentation that they steer."""
     hints = read_hints(given.get(".hints.toml"), clip)
-    rough = segment(clip.images(), hints, Effort(seed=settings.seed % 2**32), tick=_ticker(run))
+    rough = segment(clip.images(), hints, _effort(settings), tick=_ticker(run))
     return prompts_of(rough.probability > 127, hints)
 
 

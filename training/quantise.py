@@ -29,7 +29,6 @@ from training.corruption import corrupted
 from training.export import log_digests, write_model
 from training.wardrobe import Random
 
-log = logging.getLogger(__name__)
 NETWORKS = ("trunk", "finder", "refine")
 SUBJECTS = ("cat", "dog", "person")
 FRAMES = 8

@@ -61,8 +61,6 @@ def object_priors(frames: np.ndarray, network: FindingNetwork, categories: dict[
     `frames` is (T, H, W, 3) uint8 RGB; `categories` says which of the network's channels is whose. All zero where
     nothing of the category was found in any frame; a category that is seen much worse than another is left out.
     """
-    if not categories:
-        return {}
     boxes = searched_boxes(frames, network, tuple(categories.values()))
     sure = {k: _certainty(frames[::JUDGED_EVERY], b[::JUDGED_EVERY], network, k) for k, b in boxes.items()}
     least = LEAST_SURE * max(sure.values(), default=0.0)
