@@ -93,7 +93,7 @@ def shaken(poses: Tensor, degrees: float, seed: int) -> Tensor:
 def steadied(seen: Seen) -> Seen:
     """The same with root poses that have lost their jitter, as in the `poses` stage with ``poses.refine = true``."""
     tracks = [track.double().numpy() for track in seen.poses.split([len(video.time_s) for video in seen.videos])]
-    made, _, _ = steady(tracks, [np.array(video.time_s) for video in seen.videos])
+    made = steady(tracks, [np.array(video.time_s) for video in seen.videos]).tracks
     return replace(seen, poses=torch.from_numpy(np.concatenate(made)).float())
 
 

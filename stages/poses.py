@@ -31,7 +31,7 @@ from stages.registration.placing import (
 from stages.registration.search import search
 from stages.registration.seen import seen
 from stages.registration.sheets import draw_pose, draw_surface, pose_sheet
-from stages.registration.steadying import steady, wave_left
+from stages.registration.steadying import steady
 from stages.registration.structure import structure_from_motion
 from stages.registration.upright import upright
 
@@ -143,17 +143,12 @@ def _steadied(
     """Given poses that the optimiser may move begin without their jitter: it moves them smoothly."""
     if not tracks:
         return tracks
-    matrices, (axis_s, around_s), placed_s = steady(
-        [track.object_to_camera for track in tracks.values()], [clips[name].time_s for name in tracks]
-    )
-    run.metric("steadied_axis_s", axis_s)
-    run.metric("steadied_turns_s", around_s)
-    run.metric("steadied_places_s", placed_s)
+    found = steady([track.object_to_camera for track in tracks.values()], [clips[name].time_s for name in tracks])
+    run.metric("jitter_degrees", float(np.degrees(found.jitter_rad)))
+    run.metric("jitter_units", found.jitter_units)
     return {
-        name: replace(
-            track, object_to_camera=made, wave_rad=wave_left(track.object_to_camera, made, clips[name].time_s)
-        )
-        for (name, track), made in zip(tracks.items(), matrices, strict=True)
+        name: replace(track, object_to_camera=made, wave_rad=wave)
+        for (name, track), made, wave in zip(tracks.items(), found.tracks, found.wave_rad, strict=True)
     }
 
 

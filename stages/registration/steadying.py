@@ -2,69 +2,80 @@
 
 Whoever films goes around the subject and hardly rolls or climbs. So a track of rotations is taken apart into where the
 axis points that the camera goes around (in camera space, nearly still), and how far it has gone around it. Each of
-them, and the translation, is replaced by a robust local line through its neighbours. How far the neighbourhood reaches
-is chosen by leaving each frame out and predicting it from the others: poses that move smoothly as they are predict
-each other best from close by, and are left alone.
+them, and the translation, follows the likeliest smooth course (`stages.registration.courses`); where that leaves no
+noise, poses move smoothly as they are and are left alone.
+
+Courses are sought from robust local lines through the poses, which tell what goes around how often, and single frames
+that are far off, which are drawn nearer. How far a local line reaches is chosen by leaving each frame out and
+predicting it from the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stages.registration.courses import Courses, smooth
+
 REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9, 1.4, 2.2, 5.0)
-"""Reaches that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
+"""Reaches of local lines that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
 SLOW_S = 0.75
 """What jitter leaves in steady poses is slower than this (seconds, a Gaussian's width): a wave."""
 _FEWEST = 8
-_WORTH = 0.95  # share of the closest neighbours' error that a farther reach has to get below
-_NOTHING = 1e-4  # radians or units: no jitter at all
+_NOTHING = 2e-3  # radians or units: no jitter that matters
 _ROUNDS = 6
+_FINISHES = 3  # times the likeliest course is sought, each time from where the last one lies
 _FAR = 2.0  # of the mean residual: what is further off counts in proportion less (Huber)
 
 
-def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> tuple[list[np.ndarray], tuple[float, float], float]:
-    """Steadied camera_from_object (T, 4, 4) of every clip; reaches (s) of the axis and of the way around it, of places.
+class Steadied(NamedTuple):
+    """Poses without their jitter."""
 
-    `times_s` (T,) are the frames' times in seconds. A reach fits all clips; 0 means left alone.
+    tracks: list[np.ndarray]
+    """camera_from_object (T, 4, 4) of every clip."""
+    jitter_rad: float
+    """Standard deviation of the jitter that was taken out of turns about any one axis; 0: they were left alone."""
+    jitter_units: float
+    """... and of places along any one axis."""
+    wave_rad: list[tuple[float, float, float]]
+    """By how much the turns of each clip are still expected to be off about each axis of object space, but for what
+    they share: root mean square."""
+
+
+def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> Steadied:
+    """Take the jitter out of camera_from_object (T, 4, 4) of every clip, at `times_s` (T,) in seconds.
+
+    How smooth they are is read off all clips together. Clips of less than eight frames are left alone.
     """
     long = [i for i, track in enumerate(tracks) if len(track) >= _FEWEST]
-    out = [track.copy() for track in tracks]
+    out, wave = [track.copy() for track in tracks], [(0.0, 0.0, 0.0) for _ in tracks]
     if not long:
-        return out, (0.0, 0.0), 0.0
+        return Steadied(out, 0.0, 0.0, wave)
     times = [times_s[i] for i in long]
-    turns = [tracks[i][:, :3, :3] for i in long]
-    axis = main_axis(turns)
-    axis_s, aside = _steadied([turn @ axis for turn in turns], times, _directions, _angle_between)
-    still = [_turned_onto(turn @ axis, made) @ turn for turn, made in zip(turns, aside, strict=True)]
-    frames = [_frames_around(axis, made, turn) for made, turn in zip(aside, still, strict=True)]
-    gone = [
-        Rotation.from_matrix(frame.transpose(0, 2, 1) @ turn).as_rotvec() @ axis
-        for frame, turn in zip(frames, still, strict=True)
-    ]
-    around_s, smooth = _steadied(gone, times, _headings, _angle_apart)
-    placed_s, places = _steadied([tracks[i][:, :3, 3] for i in long], times, _places, _distance)
-    for k, i in enumerate(long):
-        if axis_s or around_s:
-            out[i][:, :3, :3] = frames[k] @ Rotation.from_rotvec(smooth[k][:, None] * axis).as_matrix()
-        if placed_s:
-            out[i][:, :3, 3] = places[k]
-    return out, (axis_s, around_s), placed_s
-
-
-def wave_left(given: np.ndarray, made: np.ndarray, time_s: np.ndarray) -> tuple[float, float, float]:
-    """Root mean square turn (radians) about each axis that independent errors leave in rotations made steady.
-
-    `given` (T, 4, 4) are the poses and `made` what `steady` made of them; of what was taken out, white noise, this much
-    is slower than SLOW_S.
-    """
-    turns = Rotation.from_matrix(given[:, :3, :3]).inv() * Rotation.from_matrix(made[:, :3, :3])
-    spacing_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else SLOW_S
-    slow = spacing_s / (2 * np.sqrt(np.pi) * SLOW_S)
-    wave = float(np.sqrt(np.mean(turns.magnitude() ** 2) * slow / 3))
-    return wave, wave, wave
+    seen = [tracks[i][:, :3, :3] for i in long]
+    axis = main_axis(seen)
+    turns, around, tilts = _smooth_turns(seen, _turns_by_lines(seen, axis, times), axis, times)
+    jitter_rad = max(around.noise, tilts.noise)
+    if jitter_rad > _NOTHING:
+        for i, turn, about, aslant in zip(long, turns, around.left, tilts.left, strict=True):
+            out[i][:, :3, :3] = turn
+            off = np.sqrt(about**2 * axis**2 + aslant**2 * (1 - axis**2))
+            wave[i] = (float(off[0]), float(off[1]), float(off[2]))
+    seen = [tracks[i][:, :3, 3] for i in long]
+    made = _by_lines(seen, times, _places, _distance)
+    for _ in range(_FINISHES):
+        gaps = _bounded([one - now for one, now in zip(seen, made, strict=True)])
+        places = smooth([now + gap for now, gap in zip(made, gaps, strict=True)], times)
+        made = places.made
+    if places.noise > _NOTHING:
+        for i, place in zip(long, made, strict=True):
+            out[i][:, :3, 3] = place
+    return Steadied(
+        out, jitter_rad if jitter_rad > _NOTHING else 0.0, places.noise if places.noise > _NOTHING else 0.0, wave
+    )
 
 
 def main_axis(turns: list[np.ndarray]) -> np.ndarray:
@@ -73,25 +84,29 @@ def main_axis(turns: list[np.ndarray]) -> np.ndarray:
     return np.asarray(np.linalg.eigh(spread)[1][:, -1])
 
 
-def _steadied(
+def _turns_by_lines(seen: list[np.ndarray], axis: np.ndarray, times_s: list[np.ndarray]) -> list[np.ndarray]:
+    """Rotations (T, 3, 3) `seen` made steady by local lines: where `axis` points, then the way around it."""
+    aside = _by_lines([turn @ axis for turn in seen], times_s, _directions, _angle_between)
+    still = [_turned_onto(turn @ axis, made) @ turn for turn, made in zip(seen, aside, strict=True)]
+    frames = [_frames_around(axis, made, turn) for made, turn in zip(aside, still, strict=True)]
+    gone = [_rotvec(frame.transpose(0, 2, 1) @ turn) @ axis for frame, turn in zip(frames, still, strict=True)]
+    ways = _by_lines(gone, times_s, _headings, _angle_apart)
+    return [frame @ _spin(axis, way) for frame, way in zip(frames, ways, strict=True)]
+
+
+def _by_lines(
     seen: list[np.ndarray],
     times_s: list[np.ndarray],
     lines: Callable[[np.ndarray, np.ndarray], np.ndarray],
     misses: Callable[[np.ndarray, np.ndarray], np.ndarray],
-) -> tuple[float, list[np.ndarray]]:
-    """The reach whose `lines` predict left-out frames best, and what they make of each clip.
-
-    If no reach does better than the closest neighbours: 0, and the clips as they are.
-    """
+) -> list[np.ndarray]:
+    """What `lines` of the reach that predicts left-out frames best make of each clip."""
     errors = []
     for reach in REACHES_S:
         left_out = [(one, _neighbourhood(time, reach, leave_out=True)) for one, time in zip(seen, times_s, strict=True)]
         errors.append(float(np.concatenate([misses(lines(one, near), one) for one, near in left_out]).mean()))
-    best = int(np.argmin(errors))
-    if errors[best] >= _WORTH * errors[0] or errors[0] <= _NOTHING:
-        return 0.0, seen
-    reach = REACHES_S[best]
-    return reach, [lines(one, _neighbourhood(time, reach)) for one, time in zip(seen, times_s, strict=True)]
+    reach = REACHES_S[int(np.argmin(errors))]
+    return [lines(one, _neighbourhood(time, reach)) for one, time in zip(seen, times_s, strict=True)]
 
 
 def _neighbourhood(time: np.ndarray, reach: float, leave_out: bool = False) -> np.ndarray:
@@ -145,6 +160,63 @@ def _places(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
         gaps = seen[None] - made[:, None]
         made = made + _line(_robust(weight, np.linalg.norm(gaps, axis=-1)), away, gaps)
     return made
+
+
+def _smooth_turns(
+    seen: list[np.ndarray], made: list[np.ndarray], axis: np.ndarray, times_s: list[np.ndarray]
+) -> tuple[list[np.ndarray], Courses, Courses]:
+    """Rotations (T, 3, 3) `seen` on smooth courses, from those `made` so far; the way around `axis`, and its tilts.
+
+    Both are read off the turn from what is made to what is seen: a tilt that is far off is none around the axis.
+    """
+    for _ in range(_FINISHES):
+        gaps = _bounded([_rotvec(now.transpose(0, 2, 1) @ one) for one, now in zip(seen, made, strict=True)])
+        points = [now @ axis for now in made]
+        frames = [_frames_around(axis, point, now) for point, now in zip(points, made, strict=True)]
+        ways = [
+            np.unwrap(_rotvec(frame.transpose(0, 2, 1) @ now) @ axis) + gap @ axis
+            for frame, now, gap in zip(frames, made, gaps, strict=True)
+        ]
+        around = smooth([way[:, None] for way in ways], times_s)
+        tilted = [
+            point + np.cross((now @ gap[..., None])[..., 0], point)
+            for now, gap, point in zip(made, gaps, points, strict=True)
+        ]
+        aside, tilts = _smooth_directions(points, tilted, times_s)
+        made = [
+            _turned_onto(point, moved) @ frame @ _spin(axis, way[:, 0])
+            for frame, point, moved, way in zip(frames, points, aside, around.made, strict=True)
+        ]
+    return made, around, tilts
+
+
+def _smooth_directions(
+    points: list[np.ndarray], moved: list[np.ndarray], times_s: list[np.ndarray]
+) -> tuple[list[np.ndarray], Courses]:
+    """Directions (T, 3) along `moved`, each clip's in the plane that touches the sphere in the middle of `points`."""
+    middles = [_unit(point.mean(0)) for point in points]
+    planes = [np.linalg.svd(middle[None])[2][1:].T for middle in middles]  # (3, 2)
+    courses = smooth([one @ plane for one, plane in zip(moved, planes, strict=True)], times_s)
+    return [
+        _unit(middle * np.sqrt(np.maximum(1 - (course**2).sum(1, keepdims=True), 0)) + course @ plane.T)
+        for course, middle, plane in zip(courses.made, middles, planes, strict=True)
+    ], courses
+
+
+def _bounded(gaps: list[np.ndarray]) -> list[np.ndarray]:
+    """Gaps (T, 3), those far above what is usual shortened to it: single frames may be anywhere."""
+    sizes = [np.linalg.norm(gap, axis=1, keepdims=True) for gap in gaps]
+    most = _FAR * np.concatenate(sizes).mean()
+    return [gap * np.minimum(1.0, most / np.maximum(size, 1e-12)) for gap, size in zip(gaps, sizes, strict=True)]
+
+
+def _rotvec(turns: np.ndarray) -> np.ndarray:
+    return np.asarray(Rotation.from_matrix(turns).as_rotvec())
+
+
+def _spin(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rotations (T, 3, 3) about `axis` by angles (T,)."""
+    return np.asarray(Rotation.from_rotvec(angle[:, None] * axis).as_matrix())
 
 
 def _angle_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from stages.registration.steadying import SLOW_S, main_axis, steady, wave_left
+from stages.registration.steadying import main_axis, steady
 
 FRAMES = 60
 TIME = np.arange(FRAMES) / 20
@@ -40,18 +39,19 @@ def shaken(truth: np.ndarray, degrees: float, units: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("rate", [0.0, 1.0, 4.0])
 def test_smooth_motion_is_left_alone(rate: float) -> None:
     truth = track(rate)
-    (made,), turned_s, placed_s = steady([truth], [TIME])
-    assert (turned_s, placed_s) == ((0.0, 0.0), 0.0)
-    assert np.array_equal(made, truth)
+    found = steady([truth], [TIME])
+    assert (found.jitter_rad, found.jitter_units, found.wave_rad) == (0.0, 0.0, [(0.0, 0.0, 0.0)])
+    assert np.array_equal(found.tracks[0], truth)
 
 
 @pytest.mark.parametrize(("degrees", "left"), [(5.0, 0.5), (20.0, 0.4), (50.0, 0.4)])
 def test_most_of_a_jitter_goes(degrees: float, left: float) -> None:
     truth = [track(1.0, 0.1), track(-1.0, 0.1)]
     seen = [shaken(t, degrees) for t in truth]
-    made, turned_s, placed_s = steady(seen, [TIME, TIME])
-    assert min(turned_s) > 0.05 and placed_s == 0.0
-    for found, before, t in zip(made, seen, truth, strict=True):
+    made = steady(seen, [TIME, TIME])
+    # Axes drawn evenly: a third of the square is about any one of them. Far-off turns wrap, or count less.
+    assert made.jitter_rad == pytest.approx(np.radians(degrees) / np.sqrt(3), rel=0.15) and made.jitter_units == 0.0
+    for found, before, t in zip(made.tracks, seen, truth, strict=True):
         assert errors(found, t)[0] < left * errors(before, t)[0]
         assert np.array_equal(found[:, :3, 3], t[:, :3, 3])
         identity = found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1)
@@ -69,18 +69,18 @@ def test_whoever_walks_around_upright_keeps_upright(degrees: float) -> None:
         track_[:, 2, 3] = 3.0
     seen = [shaken(t, degrees) for t in truth]
     assert abs(main_axis([s[:, :3, :3] for s in seen])[1]) > 0.9
-    made, _, _ = steady(seen, [TIME, TIME])
-    for found, t in zip(made, truth, strict=True):
-        assert errors(found, t)[0] <= 0.22 * degrees + 1e-5
+    for found, t in zip(steady(seen, [TIME, TIME]).tracks, truth, strict=True):
+        assert errors(found, t)[0] <= 0.25 * degrees + 1e-5
         tilt = np.degrees(np.arccos(np.clip((found[:, :3, 1] * t[:, :3, 1]).sum(1), -1, 1)))
-        assert tilt.mean() <= 0.2 * degrees + 1e-5
+        assert tilt.mean() <= 0.23 * degrees + 1e-5
 
 
 def test_places_are_steadied_by_themselves() -> None:
     truth = track(1.0)
     seen = shaken(truth, 0.0, 0.05)
-    (made,), turned_s, placed_s = steady([seen], [TIME])
-    assert turned_s == (0.0, 0.0) and placed_s > 0.0
+    found = steady([seen], [TIME])
+    (made,) = found.tracks
+    assert found.jitter_rad == 0.0 and found.jitter_units == pytest.approx(0.05, rel=0.15)
     assert errors(made, truth)[1] < 0.5 * errors(seen, truth)[1]
 
 
@@ -88,23 +88,28 @@ def test_one_frame_that_is_far_off_is_brought_back() -> None:
     truth = track(1.0, 0.1)
     seen = shaken(truth, 5.0)
     seen[30, :3, :3] = seen[30, :3, :3] @ Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()
-    (made,), _, _ = steady([seen], [TIME])
+    (made,) = steady([seen], [TIME]).tracks
     assert errors(made[30:31], truth[30:31])[0] < 6
 
 
 def test_a_clip_of_a_few_frames_stays() -> None:
     short = shaken(track(), 20.0)[:5]
-    (made,), turned_s, _ = steady([short], [TIME[:5]])
-    assert turned_s == (0.0, 0.0) and np.array_equal(made, short)
+    found = steady([short], [TIME[:5]])
+    assert found.jitter_rad == 0.0 and np.array_equal(found.tracks[0], short)
 
 
-def test_the_wave_that_is_left_is_what_smoothing_noise_leaves() -> None:
-    """White turns of a known size, smoothed as wide as SLOW_S, leave what is foretold about each axis."""
-    time = np.arange(4000) / 20
-    noise = np.random.default_rng(0).normal(0.0, 0.1, (len(time), 3))
-    poses = np.tile(np.eye(4), (len(time), 1, 1))
-    turned = poses.copy()
-    turned[:, :3, :3] = Rotation.from_rotvec(noise).as_matrix()
-    left = gaussian_filter1d(noise, SLOW_S * 20, axis=0)
-    assert np.allclose(wave_left(turned, poses, time), left.std(0), rtol=0.25)
-    assert wave_left(poses, poses, time) == (0.0, 0.0, 0.0)
+def test_what_is_foretold_to_be_left_is_left() -> None:
+    """Over many clips, the turns that remain wrong about each axis are as large as it is said."""
+    truth = [track(0.6 + 0.01 * i, 0.0) for i in range(40)]
+    rng = np.random.default_rng(1)
+    seen = [t.copy() for t in truth]
+    for one in seen:
+        noise = Rotation.from_rotvec(rng.normal(0.0, 0.1, (FRAMES, 3)))
+        one[:, :3, :3] = one[:, :3, :3] @ noise.as_matrix()
+    found = steady(seen, [TIME] * len(seen))
+    assert found.jitter_rad == pytest.approx(0.1, rel=0.1)
+    rest = []
+    for made, t in zip(found.tracks, truth, strict=True):
+        left = Rotation.from_matrix(t[:, :3, :3].transpose(0, 2, 1) @ made[:, :3, :3])
+        rest.append((left.mean().inv() * left).as_rotvec())
+    assert np.sqrt(np.mean(np.square(rest), (0, 1))) == pytest.approx(np.mean(found.wave_rad, 0), rel=0.25)

@@ -123,11 +123,11 @@ def test_given_poses_that_may_move_lose_their_jitter(tmp_path: Path) -> None:
         out, run = run_poses(tmp_path, given, refine=moves)
         found = read_poses(out / "a.json").object_to_camera
         if moves:
-            assert error(found) < 0.5 * error(wrong) and run.metrics["steadied_turns_s"] > 0
+            assert error(found) < 0.5 * error(wrong) and run.metrics["jitter_degrees"] > 0
             wave = read_poses(out / "a.json").wave_rad
             assert wave is not None and all(0.01 < w < 0.2 for w in wave)
         else:
-            assert np.allclose(found, wrong, atol=1e-6) and "steadied_turns_s" not in run.metrics
+            assert np.allclose(found, wrong, atol=1e-6) and "jitter_degrees" not in run.metrics
         out.rename(tmp_path / f"moves-{moves}")
 
 

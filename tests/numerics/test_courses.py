@@ -1,0 +1,65 @@
+"""Smooth courses: the dense formula of Gaussian-process regression, and what is read off the values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.registration import courses
+from stages.registration.courses import smooth
+
+
+def wandering(rng: np.random.Generator, time: np.ndarray, length: float, size: float) -> np.ndarray:
+    """A draw (T, 2) of the wander itself."""
+    covariance = np.exp(-0.5 * ((time[:, None] - time[None]) / length) ** 2) + 1e-9 * np.eye(len(time))
+    return size * np.linalg.cholesky(covariance) @ rng.normal(size=(len(time), 2))
+
+
+def test_straight_lines_stay_and_the_noise_about_them_is_told() -> None:
+    time = np.arange(50) / 10
+    rng = np.random.default_rng(0)
+    truth = [np.stack([a + b * time, -b * time], 1) for a, b in rng.normal(size=(20, 2))]
+    found = smooth([t + rng.normal(0, 0.1, t.shape) for t in truth], [time] * 20)
+    assert found.noise == pytest.approx(0.1, rel=0.06)
+    error = np.sqrt(np.mean([np.square(made - t).mean() for made, t in zip(found.made, truth, strict=True)]))
+    assert error < 1.4 * 0.1 * np.sqrt(2 / 50)  # of a straight line: two numbers from fifty
+
+
+def test_values_without_noise_are_left_as_they_are() -> None:
+    time = np.cumsum(np.random.default_rng(0).uniform(0.03, 0.07, 80))
+    value = np.stack([np.sin(2 * time), 3 * time], 1)
+    found = smooth([value], [time])
+    assert found.noise < 1e-4 and np.allclose(found.made[0], value, atol=1e-4)
+
+
+@pytest.mark.parametrize(("length", "size"), [(0.3, 0.5), (1.2, 0.2)])
+def test_courses_that_wander_are_followed_as_closely_as_is_said(length: float, size: float) -> None:
+    time, rng = np.arange(75) / 20, np.random.default_rng(1)
+    truth = [wandering(rng, time, length, size) + rng.normal() * time[:, None] for _ in range(12)]
+    found = smooth([t + rng.normal(0, 0.2, t.shape) for t in truth], [time] * 12)
+    assert found.noise == pytest.approx(0.2, rel=0.06)
+    rest = [made - t for made, t in zip(found.made, truth, strict=True)]
+    left = np.sqrt(np.mean([np.square(r - r.mean(0)).mean() for r in rest]))
+    assert left == pytest.approx(np.sqrt(np.mean(np.square(found.left))), rel=0.15) and left < 0.1
+
+
+def test_the_course_is_that_of_the_dense_formula(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(courses, "LENGTHS_S", (0.7,))
+    monkeypatch.setattr(courses, "SWINGS", (1.5,))
+    rng = np.random.default_rng(2)
+    time = np.sort(rng.uniform(0, 3, 20))
+    value = rng.normal(size=(20, 3))
+    wander = 1.5**2 * np.exp(-0.5 * ((time[:, None] - time[None]) / 0.7) ** 2)
+    line = np.stack([np.ones(20), time], 1)
+    inverse = np.linalg.inv(wander + np.eye(20))
+    slope = np.linalg.solve(line.T @ inverse @ line, line.T @ inverse @ value)
+    expected = line @ slope + wander @ inverse @ (value - line @ slope)
+    found = smooth([value], [time])
+    assert np.allclose(found.made[0], expected, atol=1e-9)
+    # A line whose offset and slope may be anything has a covariance far larger than all else.
+    loose = wander + 1e5 * line @ line.T
+    left = np.eye(20) - np.linalg.inv(loose + np.eye(20))
+    centred = np.eye(20) - 1 / 20
+    square = np.trace(value.T @ (inverse @ (value - line @ slope))) / (3 * 18)
+    assert found.noise == pytest.approx(np.sqrt(square))
+    assert found.left[0] == pytest.approx(np.sqrt(square * np.trace(centred @ left @ centred) / 20), rel=1e-3)
