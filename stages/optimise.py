@@ -88,7 +88,8 @@ class FitSettings(PhaseSettings):
     cover_from: float = 0.3
     """Share of the phase from which they do; before, limbs may not be there yet."""
     weight_spill: float = 0.02
-    """Places of the surface that stick out beside the object's mask are pulled back onto it, in pixels."""
+    """Places of the surface that stick out more than three pixels beside the object's mask are pulled back onto it, in
+    pixels."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from stages.model.fields import GridField
 _GIVEN_TURN, _GIVEN_SHIFT = 0.4, 0.015
 """Radians, units: how far given root poses that may move are off. Pictures tell a turn well and a
 distance badly, so places are held, turns hardly."""
-_SPILL_FREE_PX = 3.0  # as far beside the mask the surface may stick out: rays are drawn there, too
 _PICTURE_TERMS = ("silhouette", "rgb", "cover", "spill", "feature", "match", "cycle_2d")
 
 
@@ -180,9 +179,11 @@ def _outline(
     step: int,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """What pulls limbs where rendering has no gradient: onto pixels that nothing covers, and back from beside the mask.
+    """What pulls limbs where rendering has no gradient: onto pixels that nothing covers, back from beside the mask.
 
-    Random points of the surface are posed and projected; no ray is drawn far beside the mask.
+    Random points of the surface are posed and projected; no ray is drawn far beside the mask. The first pixels beside
+    it are free: there the outline is the rays' to settle, and a price that nothing answers from within the mask would
+    make the body thinner.
     """
     cover = settings.weight_cover > 0 and step >= settings.cover_from * settings.iterations
     spill = settings.weight_spill > 0 and step >= settings.spill_from * settings.iterations and batch.beside is not None
@@ -199,7 +200,7 @@ def _outline(
     if spill and batch.beside is not None:
         scale = batch.beside_scale[..., None]
         beside_px = batch.beside.to(placed.dtype) / (BESIDE_UNITS * scale)
-        value = losses.spill_loss(placed * scale, beside_px, batch.weight, farthest_px, _SPILL_FREE_PX)
+        value = losses.spill_loss(placed * scale, beside_px, batch.weight, farthest_px)
         terms["spill"] = settings.weight_spill * value
     return terms
 

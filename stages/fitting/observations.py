@@ -15,7 +15,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 BESIDE_UNITS = 4
-"""Distances from a silhouette are kept in quarters of its pixels, up to 63 of them."""
+"""Distances beside a silhouette are kept in quarters of its pixels, up to 63 of them."""
+FREE_PX = 3.0
+"""As far beside the mask the surface may stick out: rays are drawn there, too."""
 
 
 @dataclass
@@ -37,7 +39,7 @@ class Observations:
     partner: dict[int, Tensor] = field(default_factory=dict)  # step -> (T,) int64, -1 = none
     features: np.ndarray | None = None  # (T, 112, 112, 16) float16, may be memory-mapped
     crops: Tensor | None = None  # (T, 4): x0, y0, x1, y1 of the feature maps, pixels
-    beside: Tensor | None = None  # (T, h, w) uint8: distance from the silhouette, in 1 / BESIDE_UNITS of its pixels
+    beside: Tensor | None = None  # (T, h, w) uint8: beyond FREE_PX from the mask, 1 / BESIDE_UNITS of a silhouette's
 
     def __len__(self) -> int:
         return len(self.video_idx)
@@ -79,6 +81,10 @@ class ObservationBuilder:
         small = resize(mask.astype(np.float32), size, order=1, anti_aliasing=scale < 1, preserve_range=True)
         canvas = np.zeros((self.small_px, self.small_px), np.uint8)
         canvas[: size[0], : size[1]] = np.clip(np.round(small), 0, 255)
+        beside = np.zeros_like(canvas)
+        if inside.any():
+            away = resize(np.maximum(beyond - FREE_PX, 0.0), size, order=1, anti_aliasing=scale < 1)
+            beside[: size[0], : size[1]] = np.round(np.minimum(BESIDE_UNITS * scale * away, 255))
         self._push(
             self._rows,
             xy=np.stack([columns, rows], 1).astype(np.int16),
@@ -104,7 +110,7 @@ class ObservationBuilder:
             video=np.int64(video_idx),
             weight=np.float32(weight if inside.any() else 0.0),
             small=canvas,
-            beside=_distance_beside(canvas > 127),
+            beside=beside,
             scale=np.float32(size[1] / width),
             size=np.array([width, height], np.float32),
             count=np.int64(len(rows)),
@@ -141,10 +147,3 @@ class ObservationBuilder:
             crops=None if crops is None else torch.from_numpy(np.asarray(crops, np.float32)),
             beside=torch.from_numpy(np.stack(self._frames["beside"])),
         )
-
-
-def _distance_beside(inside: np.ndarray) -> np.ndarray:
-    """(h, w) uint8 distance from `inside` (h, w), see BESIDE_UNITS; zero everywhere where there is no object."""
-    if not inside.any():
-        return np.zeros(inside.shape, np.uint8)
-    return np.round(np.minimum(BESIDE_UNITS * distance_transform_edt(~inside), 255)).astype(np.uint8)

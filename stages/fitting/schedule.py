@@ -77,7 +77,8 @@ class PhaseSettings:
     cover_from: float = 0.2
     """Share of the phase from which they do; before, limbs may not be there yet."""
     weight_spill: float = 0.0
-    """Places of the surface that stick out beside the object's mask are pulled back onto it, in pixels."""
+    """Places of the surface that stick out more than three pixels beside the object's mask are pulled back onto it, in
+    pixels."""
     spill_from: float = 0.2
     """Share of the phase from which they are."""
     weight_feature: float = 0.05

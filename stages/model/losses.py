@@ -51,18 +51,16 @@ def coverage_loss(placed_px: Tensor, pixels: Tensor, weight: Tensor, cap_px: flo
     return (huber(error, corner=2.0, cap=cap_px) * weight).mean()
 
 
-def spill_loss(placed: Tensor, beside: Tensor, weight: Tensor, cap_px: float, free_px: float = 0.0) -> Tensor:
+def spill_loss(placed: Tensor, beside: Tensor, weight: Tensor, cap_px: float) -> Tensor:
     """How far (Huber, corner 2 px, constant beyond `cap_px`) points lie beside the mask; zero on it, or off the map.
 
-    The first `free_px` pixels cost nothing: where rays are drawn the outline is theirs to settle, and a price that
-    nothing answers from within the mask would make the body thinner.
     `placed` (F, N, 2) are x, y in cells of the maps `beside` (F, h, w) of distance to the mask in pixels; `weight`
     (F, 1) is the trust in the frame.
     """
     size = torch.tensor([beside.shape[2], beside.shape[1]], dtype=placed.dtype, device=placed.device)
     unit = placed / size * 2 - 1
     away = torch.nn.functional.grid_sample(beside[:, None], unit[:, None], align_corners=False)[:, 0, 0]
-    return (huber((away - free_px).clamp_min(0), corner=2.0, cap=cap_px) * weight).mean()
+    return (huber(away, corner=2.0, cap=cap_px) * weight).mean()
 
 
 def feature_loss(rendered: Tensor, observed: Tensor, weight: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from stages.fitting import batches
 from stages.fitting.batches import draw, step_generator
-from stages.fitting.observations import BESIDE_UNITS, ObservationBuilder
+from stages.fitting.observations import BESIDE_UNITS, FREE_PX, ObservationBuilder
 from stages.geometry.cameras import project, transform
 from tests.numerics.analytic_scene import Scene, describe_point, look, scene, sphere
 
@@ -148,16 +148,35 @@ def test_picked_pixels_are_those_of_the_batch(seen: Scene) -> None:
     assert picked.frame_idx is batch.frame_idx
 
 
-def test_batches_know_how_far_the_mask_is(seen: Scene) -> None:
+def test_batches_know_how_far_from_the_mask_a_place_is(seen: Scene) -> None:
     batch = batches.look(seen.observations, torch.arange(len(seen.observations)), 4, step_generator(0, 0))
     assert batch.beside is not None
     assert torch.equal(batch.beside_scale[:, 0], seen.observations.silhouette_scale)
     for frame, beside in enumerate(batch.beside):
-        inside = seen.observations.silhouettes[frame].numpy() > 127
-        rows, columns = np.nonzero(inside)
-        for row, column in ((0, 0), (rows[0], columns[0]), (inside.shape[0] - 1, 3)):
-            nearest = np.hypot(rows - row, columns - column).min()
-            assert int(beside[row, column]) == round(min(nearest * BESIDE_UNITS, 255))
+        rows = slice(int(seen.observations.offsets[frame]), int(seen.observations.offsets[frame + 1]))
+        inside = seen.observations.xy[rows][seen.observations.mask[rows] > 127].double()
+        scale = float(seen.observations.silhouette_scale[frame])
+        width, height = (int(x) for x in seen.observations.image_size[frame])
+        for x, y in ((0, 0), (width - 1, 3), (2, height - 2), (int(inside[0, 0]), int(inside[0, 1]))):
+            nearest = float((inside - torch.tensor([x, y])).norm(dim=1).min())
+            found = float(beside[int((y + 0.5) * scale), int((x + 0.5) * scale)]) / BESIDE_UNITS / scale
+            assert found == pytest.approx(max(0.0, nearest - FREE_PX), abs=0.75 / scale)
+
+
+def test_a_thin_leg_is_nothing_that_sticks_out_and_beyond_the_picture_all_is_free() -> None:
+    """A leg much thinner than a cell of the small maps is in none of them, yet rays are drawn there."""
+    mask = np.zeros((300, 600), np.uint8)
+    mask[40:200, 100:104] = 255
+    builder = ObservationBuilder((), small_px=60)
+    builder.add(0, np.zeros((300, 600, 3), np.uint8), mask, {}, 1.0)
+    observations = builder.finish()
+    assert observations.beside is not None and int(observations.silhouettes[0].max()) < 127
+    beside = observations.beside[0].numpy()
+    assert beside[4:20, 10].max() <= 1 and beside[4:20, 20:30].min() > 8 * BESIDE_UNITS
+    assert not beside[30:].any()  # below the picture
+
+
+def test_an_empty_mask_pulls_nothing_back() -> None:
     empty = ObservationBuilder(())
     empty.add(0, np.zeros((12, 16, 3), np.uint8), np.zeros((12, 16), np.uint8), {}, 1.0)
     observations = empty.finish()
