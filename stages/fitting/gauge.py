@@ -19,8 +19,9 @@ from torch import Tensor
 
 from stages.geometry.rotations import invert_rigid, matrix_to_quaternion, quaternion_to_matrix, rigid
 from stages.model.banmo import Banmo
-from stages.registration.steadying import SLOW_S
 
+SLOW_S = 0.75
+"""What jitter leaves in steady poses is slower than this (seconds, a Gaussian's width): a wave."""
 SWAY_SOFTNESS = 0.12
 """As `softness` below, where a trunk that does sway must not be told from one that seems to: more of the body votes."""
 

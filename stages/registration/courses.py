@@ -30,20 +30,36 @@ class Courses(NamedTuple):
     """Standard deviation of the noise, in the values' unit."""
 
 
-def smooth(values: list[np.ndarray], times_s: list[np.ndarray]) -> Courses:
-    """The likeliest courses through `values` (T, C) at `times_s` (T,), three times or more each."""
-    lines = [_line_basis(time) for time in times_s]
-    likelihood, best = -np.inf, (0.0, 0.0, 0.0)
-    for length in LENGTHS_S:
-        modes = [_modes(value, time, line, length) for value, time, line in zip(values, times_s, lines, strict=True)]
-        for swing in SWINGS:
-            now, noise = _restricted(modes, swing)
+class Basis(NamedTuple):
+    """What smoothing needs of a clip's times alone; all that takes long."""
+
+    line: np.ndarray
+    """(T, 2): an offset and a slope, orthonormal."""
+    wanders: list[tuple[np.ndarray, np.ndarray]]
+    """Eigenvalues (T,) and eigenvectors (T, T) of the wander's covariance, for each of LENGTHS_S."""
+
+
+def basis(time_s: np.ndarray) -> Basis:
+    """The basis of a clip at times (T,) in seconds, three or more."""
+    middle = time_s - time_s.mean()
+    line = np.linalg.qr(np.stack([np.ones_like(middle), middle], 1))[0]
+    away = time_s[:, None] - time_s[None]
+    found = [np.linalg.eigh(np.exp(-0.5 * (away / length) ** 2)) for length in LENGTHS_S]
+    return Basis(line, [(np.maximum(variances, _FLOOR), vectors) for variances, vectors in found])
+
+
+def smooth(values: list[np.ndarray], bases: list[Basis]) -> Courses:
+    """The likeliest courses through `values` (T, C) at the times of `bases`."""
+    likelihood, best, swing, noise = -np.inf, 0, 0.0, 0.0
+    for length in range(len(LENGTHS_S)):
+        modes = [_modes(value, base, length) for value, base in zip(values, bases, strict=True)]
+        for size in SWINGS:
+            now, spread = _restricted(modes, size)
             if now > likelihood:
-                likelihood, best = now, (length, swing, noise)
-    length, swing, noise = best
+                likelihood, best, swing, noise = now, length, size, spread
     made, left = [], []
-    for value, time, line in zip(values, times_s, lines, strict=True):
-        course, variance = _posterior(_modes(value, time, line, length), swing)
+    for value, base in zip(values, bases, strict=True):
+        course, variance = _posterior(_modes(value, base, best), swing)
         made.append(course)
         left.append(noise * float(np.sqrt(variance)))
     return Courses(made, left, noise)
@@ -58,16 +74,9 @@ class _Modes(NamedTuple):
     line: np.ndarray  # (T, 2): an offset and a slope
 
 
-def _line_basis(time_s: np.ndarray) -> np.ndarray:
-    """(T, 2): an offset and a slope, orthonormal."""
-    middle = time_s - time_s.mean()
-    return np.linalg.qr(np.stack([np.ones_like(middle), middle], 1))[0]
-
-
-def _modes(value: np.ndarray, time_s: np.ndarray, line: np.ndarray, length_s: float) -> _Modes:
-    away = (time_s[:, None] - time_s[None]) / length_s
-    variances, vectors = np.linalg.eigh(np.exp(-0.5 * away**2))
-    return _Modes(vectors, np.maximum(variances, _FLOOR), vectors.T @ value, vectors.T @ line)
+def _modes(value: np.ndarray, base: Basis, length: int) -> _Modes:
+    variances, vectors = base.wanders[length]
+    return _Modes(vectors, variances, vectors.T @ value, vectors.T @ base.line)
 
 
 def _without_line(modes: _Modes, swing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,12 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.registration.courses import Courses, smooth
+from stages.registration.courses import Basis, Courses, basis, smooth
 
 REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9, 1.4, 2.2, 5.0)
 """Reaches of local lines that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
-SLOW_S = 0.75
-"""What jitter leaves in steady poses is slower than this (seconds, a Gaussian's width): a wave."""
 _FEWEST = 8
 _NOTHING = 2e-3  # radians or units: no jitter that matters
 _ROUNDS = 6
@@ -55,11 +53,12 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> Steadied:
     if not long:
         return Steadied(out, 0.0, 0.0, wave)
     times = [times_s[i] for i in long]
+    bases = [basis(time) for time in times]
     seen = [tracks[i][:, :3, :3] for i in long]
     axis = main_axis(seen)
-    turns, around, tilts = _smooth_turns(seen, _turns_by_lines(seen, axis, times), axis, times)
-    jitter_rad = max(around.noise, tilts.noise)
-    if jitter_rad > _NOTHING:
+    turns, around, tilts = _smooth_turns(seen, _turns_by_lines(seen, axis, times), axis, bases)
+    jitter_rad = _told(max(around.noise, tilts.noise))
+    if jitter_rad:
         for i, turn, about, aslant in zip(long, turns, around.left, tilts.left, strict=True):
             out[i][:, :3, :3] = turn
             off = np.sqrt(about**2 * axis**2 + aslant**2 * (1 - axis**2))
@@ -68,14 +67,17 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> Steadied:
     made = _by_lines(seen, times, _places, _distance)
     for _ in range(_FINISHES):
         gaps = _bounded([one - now for one, now in zip(seen, made, strict=True)])
-        places = smooth([now + gap for now, gap in zip(made, gaps, strict=True)], times)
+        places = smooth([now + gap for now, gap in zip(made, gaps, strict=True)], bases)
         made = places.made
-    if places.noise > _NOTHING:
+    jitter_units = _told(places.noise)
+    if jitter_units:
         for i, place in zip(long, made, strict=True):
             out[i][:, :3, 3] = place
-    return Steadied(
-        out, jitter_rad if jitter_rad > _NOTHING else 0.0, places.noise if places.noise > _NOTHING else 0.0, wave
-    )
+    return Steadied(out, jitter_rad, jitter_units, wave)
+
+
+def _told(noise: float) -> float:
+    return noise if noise > _NOTHING else 0.0
 
 
 def main_axis(turns: list[np.ndarray]) -> np.ndarray:
@@ -163,7 +165,7 @@ def _places(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def _smooth_turns(
-    seen: list[np.ndarray], made: list[np.ndarray], axis: np.ndarray, times_s: list[np.ndarray]
+    seen: list[np.ndarray], made: list[np.ndarray], axis: np.ndarray, bases: list[Basis]
 ) -> tuple[list[np.ndarray], Courses, Courses]:
     """Rotations (T, 3, 3) `seen` on smooth courses, from those `made` so far; the way around `axis`, and its tilts.
 
@@ -177,12 +179,12 @@ def _smooth_turns(
             np.unwrap(_rotvec(frame.transpose(0, 2, 1) @ now) @ axis) + gap @ axis
             for frame, now, gap in zip(frames, made, gaps, strict=True)
         ]
-        around = smooth([way[:, None] for way in ways], times_s)
+        around = smooth([way[:, None] for way in ways], bases)
         tilted = [
             point + np.cross((now @ gap[..., None])[..., 0], point)
             for now, gap, point in zip(made, gaps, points, strict=True)
         ]
-        aside, tilts = _smooth_directions(points, tilted, times_s)
+        aside, tilts = _smooth_directions(points, tilted, bases)
         made = [
             _turned_onto(point, moved) @ frame @ _spin(axis, way[:, 0])
             for frame, point, moved, way in zip(frames, points, aside, around.made, strict=True)
@@ -191,12 +193,12 @@ def _smooth_turns(
 
 
 def _smooth_directions(
-    points: list[np.ndarray], moved: list[np.ndarray], times_s: list[np.ndarray]
+    points: list[np.ndarray], moved: list[np.ndarray], bases: list[Basis]
 ) -> tuple[list[np.ndarray], Courses]:
     """Directions (T, 3) along `moved`, each clip's in the plane that touches the sphere in the middle of `points`."""
     middles = [_unit(point.mean(0)) for point in points]
     planes = [np.linalg.svd(middle[None])[2][1:].T for middle in middles]  # (3, 2)
-    courses = smooth([one @ plane for one, plane in zip(moved, planes, strict=True)], times_s)
+    courses = smooth([one @ plane for one, plane in zip(moved, planes, strict=True)], bases)
     return [
         _unit(middle * np.sqrt(np.maximum(1 - (course**2).sum(1, keepdims=True), 0)) + course @ plane.T)
         for course, middle, plane in zip(courses.made, middles, planes, strict=True)

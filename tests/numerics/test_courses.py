@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.registration import courses
-from stages.registration.courses import smooth
+from stages.registration.courses import basis, smooth
 
 
 def wandering(rng: np.random.Generator, time: np.ndarray, length: float, size: float) -> np.ndarray:
@@ -19,7 +19,7 @@ def test_straight_lines_stay_and_the_noise_about_them_is_told() -> None:
     time = np.arange(50) / 10
     rng = np.random.default_rng(0)
     truth = [np.stack([a + b * time, -b * time], 1) for a, b in rng.normal(size=(20, 2))]
-    found = smooth([t + rng.normal(0, 0.1, t.shape) for t in truth], [time] * 20)
+    found = smooth([t + rng.normal(0, 0.1, t.shape) for t in truth], [basis(time)] * 20)
     assert found.noise == pytest.approx(0.1, rel=0.06)
     error = np.sqrt(np.mean([np.square(made - t).mean() for made, t in zip(found.made, truth, strict=True)]))
     assert error < 1.4 * 0.1 * np.sqrt(2 / 50)  # of a straight line: two numbers from fifty
@@ -28,7 +28,7 @@ def test_straight_lines_stay_and_the_noise_about_them_is_told() -> None:
 def test_values_without_noise_are_left_as_they_are() -> None:
     time = np.cumsum(np.random.default_rng(0).uniform(0.03, 0.07, 80))
     value = np.stack([np.sin(2 * time), 3 * time], 1)
-    found = smooth([value], [time])
+    found = smooth([value], [basis(time)])
     assert found.noise < 1e-4 and np.allclose(found.made[0], value, atol=1e-4)
 
 
@@ -36,7 +36,7 @@ def test_values_without_noise_are_left_as_they_are() -> None:
 def test_courses_that_wander_are_followed_as_closely_as_is_said(length: float, size: float) -> None:
     time, rng = np.arange(75) / 20, np.random.default_rng(1)
     truth = [wandering(rng, time, length, size) + rng.normal() * time[:, None] for _ in range(12)]
-    found = smooth([t + rng.normal(0, 0.2, t.shape) for t in truth], [time] * 12)
+    found = smooth([t + rng.normal(0, 0.2, t.shape) for t in truth], [basis(time)] * 12)
     assert found.noise == pytest.approx(0.2, rel=0.06)
     rest = [made - t for made, t in zip(found.made, truth, strict=True)]
     left = np.sqrt(np.mean([np.square(r - r.mean(0)).mean() for r in rest]))
@@ -54,7 +54,7 @@ def test_the_course_is_that_of_the_dense_formula(monkeypatch: pytest.MonkeyPatch
     inverse = np.linalg.inv(wander + np.eye(20))
     slope = np.linalg.solve(line.T @ inverse @ line, line.T @ inverse @ value)
     expected = line @ slope + wander @ inverse @ (value - line @ slope)
-    found = smooth([value], [time])
+    found = smooth([value], [basis(time)])
     assert np.allclose(found.made[0], expected, atol=1e-9)
     # A line whose offset and slope may be anything has a covariance far larger than all else.
     loose = wander + 1e5 * line @ line.T
