@@ -61,6 +61,17 @@ def misfit(shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Obse
     return cost
 
 
+def misfit_of_each(
+    shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frames: Tensor
+) -> Tensor:
+    """How badly the shape of each of `frames` (T,) fits that frame: (T,) of shapes (T, N, 3); as in :func:`misfit`."""
+    told = [
+        misfit(shapes[i : i + 1], poses[i : i + 1], intrinsics[i : i + 1], observations, frames[i : i + 1])[0]
+        for i in range(len(frames))
+    ]
+    return torch.cat(told)
+
+
 def misfit_in_frame(
     shapes: Tensor, poses: Tensor, intrinsics: Tensor, observations: Observations, frame: int, chunk: int = 512
 ) -> Tensor:

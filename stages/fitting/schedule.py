@@ -123,8 +123,9 @@ class PhaseSettings:
     mend_from: float = 0.3
     """Share of the phase from which that is done; before, limbs may still grow together."""
     rethink_at: tuple[float, ...] = ()
-    """Shares of the phase at which stretches of motion that are explained badly are read anew: poses of other frames
-    are fitted there, too, and taken where they explain the pictures better; empty = never, as are 0 and 1."""
+    """Shares of the phase at which stretches of motion that are explained badly, or that another motion might explain,
+    are read anew: poses of other frames are fitted there, too, and taken where they explain the pictures better;
+    empty = never, as are 0 and 1."""
     rethink_share: float = 0.08
     """Work that goes into one such second thought, as a share of the phase's steps."""
     reject_at: float = 2.0

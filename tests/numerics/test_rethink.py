@@ -132,23 +132,63 @@ def test_the_other_reading_is_another_pose(model: Banmo) -> None:
     asked = torch.zeros(2 * FRAMES, dtype=torch.bool)
     asked[10:20] = True
     known = observations(2 * FRAMES)
-    wanted = rethink.other_reading(model, known, asked)
-    assert torch.equal(wanted >= 0, asked)
+    wanted, excess = rethink.other_readings(model, known, asked)
+    assert torch.equal(wanted >= 0, asked) and torch.equal(torch.isfinite(excess), asked)
     points = model.surface[:: max(1, len(model.surface) // 160)]
     shapes = rethink.known_shapes(model, torch.arange(2 * FRAMES), points)
     apart = (shapes[wanted[asked]] - shapes[asked]).square().sum(-1).mean(-1).sqrt()
     assert float(apart.min()) > 0.9 * rethink._APART
     wide = known.silhouettes.clone()
     known.silhouettes[:, :, :20] = 0  # something to choose by
-    wanted = rethink.other_reading(model, known, asked)
+    wanted, excess = rethink.other_readings(model, known, asked)
     turn = so3_exp(torch.randn(2 * FRAMES, 3, generator=torch.Generator().manual_seed(2)))
     model.gauge.copy_(rigid(turn, torch.zeros(2 * FRAMES, 3)))  # no picture tells root from bones
-    assert torch.equal(rethink.other_reading(model, known, asked), wanted)
+    turned = rethink.other_readings(model, known, asked)
+    assert torch.equal(turned.frame, wanted) and torch.allclose(turned.excess, excess, atol=1e-3)
     known.silhouettes = wide
     known.frame_weight[wanted[asked].unique()] = 0
-    assert known.frame_weight[rethink.other_reading(model, known, asked)[asked & (known.frame_weight > 0)]].all()
+    assert known.frame_weight[rethink.other_readings(model, known, asked).frame[asked & (known.frame_weight > 0)]].all()
     known.frame_weight[:] = 0
-    assert (rethink.other_reading(model, known, asked) < 0).all()
+    assert (rethink.other_readings(model, known, asked).frame < 0).all()
+
+
+def test_what_another_pose_suits_as_well_is_looked_at_though_nothing_stands_out(model: Banmo) -> None:
+    excess, without = torch.full((2 * FRAMES,), 0.9), torch.zeros(2 * FRAMES, dtype=torch.bool)
+    excess[:FRAMES] = 0.2 + torch.arange(FRAMES) / 100
+    excess[50:60] = 0.1
+    excess[70:73] = -0.3  # too short
+    without[:8] = True
+    found = torch.nonzero(rethink.closest(excess, model, without, most=25))[:, 0].tolist()
+    assert 20 <= len(found) <= 25
+    assert set(range(51, 59)) | set(range(8, 18)) <= set(found) <= set(range(48, 62)) | set(range(8, 30))
+    assert not rethink.closest(excess, model, without, most=0).any()
+    assert torch.equal(rethink.closest(excess, model, without, most=999), ~without)
+    excess[:FRAMES] = torch.inf
+    assert not rethink.closest(excess, model, without, most=999)[:FRAMES].any()
+    assert not rethink.closest(torch.full_like(excess, torch.inf), model, without, most=999).any()
+
+
+def test_a_path_goes_on_as_the_motion_did_and_ends_with_its_clip(model: Banmo) -> None:
+    every = torch.arange(2 * FRAMES)
+    after = rethink._next(every, model)
+    assert after[:3].tolist() == [1, 2, 3] and after[[FRAMES - 1, -1]].tolist() == [FRAMES - 1, 2 * FRAMES - 1]
+    shapes = rethink.known_shapes(model, every, model.surface)
+    price = rethink.jumps(shapes, shapes[after])
+    assert torch.equal(price.argmin(1), after)
+    # A clip whose middle says nothing is read as the course that led from its start to its end.
+    cost = torch.full((20, 2 * FRAMES), 0.1)
+    cost[0, 50] = cost[-1, 69] = 0.0
+    assert rethink.best_sequence(cost, price).tolist() == list(range(50, 70))
+
+
+def test_of_long_collections_some_stretches_are_read(model: Banmo) -> None:
+    known = observations(2 * FRAMES)
+    known.frame_weight[15:20] = 0
+    every = rethink.drawn(known, model, 999, seed=0)
+    assert torch.equal(every, known.frame_weight > 0)
+    few = rethink.drawn(known, model, 20, seed=0)
+    assert 15 <= few.sum() <= 20 and not (few & ~every).any()
+    assert any(not torch.equal(few, rethink.drawn(known, model, 20, seed)) for seed in range(1, 5))
 
 
 def test_the_worst_stretches_come_first_if_there_is_no_time_for_all(model: Banmo) -> None:
@@ -161,6 +201,23 @@ def test_the_worst_stretches_come_first_if_there_is_no_time_for_all(model: Banmo
     assert torch.equal(rethink.worst(asked, error, model, most=99), asked)
     assert rethink.worst(asked, error, model, most=4).sum() == 4
     assert not rethink.worst(torch.zeros_like(asked), error, model, most=99).any()
+
+
+@pytest.mark.parametrize(("gain", "taken"), [(0.01, False), (0.2, True)])
+def test_a_clip_misread_from_end_to_end_must_gain_clearly(model: Banmo, gain: float, taken: bool) -> None:
+    """Nothing stands out: every frame is explained as well as every other."""
+    before, known = codes(model), observations(2 * FRAMES)
+
+    def figures_of(some: Banmo, focus: Observations) -> FrameFigures:
+        moved = (codes(some) - before).norm(dim=1) > 0.1 * float(before.norm(dim=1).mean())
+        error = torch.full((2 * FRAMES,), 0.1)
+        error[moved] *= 1 - gain
+        error[focus.frame_weight == 0] = torch.nan
+        return FrameFigures(1 - error, error, torch.full_like(error, torch.nan), error)
+
+    told = rethink.second_thoughts(model, known, figures_of, lambda some, focus: None, most=40, seed=0)
+    assert 20 <= told.looked_at <= 40
+    assert (told.taken >= 0.5 * told.looked_at) == taken and (told.taken > 0) == taken
 
 
 @pytest.mark.parametrize("helps", [True, False])
