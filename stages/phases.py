@@ -57,6 +57,9 @@ def run_phase(
     if not team.leads:
         return
     model = trainer.model
+    if settings.recur_at:
+        for name, count in zip(("frames_paired", "frames_shared"), trainer.shared.tolist(), strict=True):
+            run.metric(name, count)
     if settings.rethink_at:
         for name, count in zip(("frames_doubted", "frames_reread"), trainer.reread.tolist(), strict=True):
             run.metric(name, count)
@@ -141,6 +144,9 @@ def _train(
             run.log.info("new bones follow the old motion to %.4f units (rms)", trainer.renewal_error)
             run.metric("renewed_bones_rms", round(trainer.renewal_error, 5))
             trainer.renewal_error = None
+        if trainer.recurred is not None:
+            run.log.info("shared motion: %d frames paired, %d taken, %.4f units off (rms)", *trainer.recurred)
+            trainer.recurred = None
         if trainer.rethought is not None:
             run.log.info("second thoughts: %d frames looked at, %d read anew, %.4f units off (rms)", *trainer.rethought)
             trainer.rethought = None

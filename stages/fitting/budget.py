@@ -19,11 +19,12 @@ def affordable_steps(trainer: Trainer, minutes: float, tries: int = 6) -> int:
     """
     model = deepcopy(trainer.model)
     settings = trainer.settings
-    trial = Trainer(model, trainer.observations, replace(settings, rethink_at=()), trainer.team)
+    trial = Trainer(model, trainer.observations, replace(settings, rethink_at=(), recur_at=()), trainer.team)
     trial.step()  # the first one also warms caches
     start = time.perf_counter()
     for _ in range(tries):
         trial.step()
     each = (time.perf_counter() - start) / tries
-    each *= 1 + settings.rethink_share * len({at for at in settings.rethink_at if 0 < at < 1})
+    asides = [at for times in (settings.rethink_at, settings.recur_at) for at in set(times) if 0 < at < 1]
+    each *= 1 + settings.rethink_share * len(asides)
     return max(_LEAST, min(_MOST, round(minutes * 60 * (1 - _OVERHEAD) / each)))

@@ -16,6 +16,7 @@ from stages.geometry.rotations import interpolate_rigid
 from stages.model.banmo import Banmo, FrameState
 
 _RANK = 11  # of the generator: draws of its own
+_SAY = (1.0, 1.0, 0.5)  # silhouette, colour, features: a network may take left for right, too
 
 
 class FrameFigures(NamedTuple):
@@ -25,6 +26,18 @@ class FrameFigures(NamedTuple):
     flow_px: Tensor  # (T,) median distance of rendered from seen flow where that is trusted
     feature: Tensor  # (T,) mean squared distance of rendered from seen features, 0..4
     colour: Tensor  # (T,) mean distance of rendered from seen colour, 0..1 a channel
+
+
+def unexplained(figures: FrameFigures) -> Tensor:
+    """(T, 3): what of silhouette, colour and features is not explained; NaN where nothing was compared."""
+    return torch.stack([1 - figures.overlap, figures.colour, figures.feature], 1)
+
+
+def relative_error(figures: FrameFigures, usual: Tensor) -> Tensor:
+    """(T,) weighted mean of what is unexplained over what usually is (3,), of what is known; NaN where nothing is."""
+    ratio = unexplained(figures) / usual
+    weight = torch.tensor(_SAY) * ~ratio.isnan()
+    return (ratio.nan_to_num() * weight).sum(1) / torch.where(weight.any(1), weight.sum(1), torch.nan)
 
 
 @torch.no_grad()

@@ -7,6 +7,8 @@ mask no point comes near. Dynamic programming over time picks a sequence.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
@@ -17,6 +19,9 @@ from stages.fitting.renew import posed
 from stages.geometry.cameras import project, transform
 from stages.geometry.rotations import invert_rigid
 from stages.model.banmo import Banmo
+
+_JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit off the course of the known motion
+_POINTS = 160
 
 
 def spread(count: int, most: int) -> Tensor:
@@ -99,6 +104,58 @@ def misfit_in_frame(
         bare = torch.cdist(some[None].expand(len(pixels), -1, -1), pixels).amin(-1)
         found.append((far[row, column].mean(1) + 1.5 * (bare - 1.0).clamp_min(0).mean(1)) / size)
     return torch.cat(found)
+
+
+class KnownMotion(NamedTuple):
+    """What a model has been seen in, and how it went on from there."""
+
+    frames: Tensor  # (K,)
+    points: Tensor  # (N, 3) canonical
+    shapes: Tensor  # (K, N, 3) as by known_shapes
+    jump: Tensor  # (K, K) price of going from one to another, in object sizes of misfit
+
+
+@torch.no_grad()
+def known_motion(model: Banmo, frames: Tensor, most: int) -> KnownMotion:
+    """Up to `most` of kept `frames` (T,), spread evenly."""
+    known = frames[spread(len(frames), most)]
+    points = model.surface[spread(len(model.surface), _POINTS)]
+    shapes = known_shapes(model, known, points).cpu()
+    return KnownMotion(known, points, shapes, jumps(shapes, known_shapes(model, following(known, model), points).cpu()))
+
+
+def jumps(shapes: Tensor, after: Tensor) -> Tensor:
+    """Price (K, K) of going from one known shape (K, N, 3) to another; `after` (K, N, 3) is what each went on to.
+
+    Going on as the motion went on there costs nothing, resting costs what it moved: motions recur as a whole, and a
+    stretch of one that was seen well elsewhere is likelier than a mix of single poses.
+    """
+    return _JUMP * torch.stack([(shapes - shape).norm(dim=-1).mean(-1) for shape in after])
+
+
+class Laid(NamedTuple):
+    """Known motion laid over the masks of a stretch."""
+
+    cost: Tensor  # (T, K) how badly each known pose lies there, as by misfit
+    own: Tensor  # (T,) ... and the pose that was found
+    now: Tensor  # (T, N, 3) that pose
+
+
+@torch.no_grad()
+def lay_over(motion: KnownMotion, model: Banmo, observations: Observations, stretch: Tensor) -> Laid:
+    """Known motion on the frames (T,) of a stretch, at their root poses."""
+    states = [model.frames(part) for part in stretch.split(64)]
+    poses = (torch.cat([state.camera_from_object for state in states]) @ model.gauge[stretch]).cpu()
+    intrinsics = torch.cat([state.intrinsics for state in states]).cpu()
+    now = known_shapes(model, stretch, motion.points).cpu()
+    cost = misfit(motion.shapes, poses, intrinsics, observations, stretch)
+    return Laid(cost, misfit_of_each(now, poses, intrinsics, observations, stretch), now)
+
+
+def following(frames: Tensor, model: Banmo) -> Tensor:
+    """The frame (N,) that follows each of `frames` (N,) in its clip; the last is followed by itself."""
+    last = torch.as_tensor(model.starts)[1:][model.video_idx.cpu()[frames]] - 1
+    return torch.minimum(frames + 1, last)
 
 
 def best_sequence(cost: Tensor, jump: Tensor) -> Tensor:

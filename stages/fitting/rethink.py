@@ -21,25 +21,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from stages.fitting.diagnose import FrameFigures
-from stages.fitting.known_poses import best_sequence, known_shapes, misfit, misfit_of_each, spread
+from stages.fitting.diagnose import FrameFigures, relative_error, unexplained
+from stages.fitting.known_poses import best_sequence, known_motion, lay_over, spread
 from stages.fitting.observations import Observations
 from stages.fitting.renew import imitate, posed
+from stages.fitting.stretches import between, clips, drawn, long_runs, runs, smoothed, window
 from stages.model.banmo import Banmo
 
 _SMOOTH_S = 0.25  # seconds over which errors are averaged: a single bad frame is no other reading
 _GAIN_S = 0.5  # ... and over which it is judged which reading is better
 _LEAST_S = 0.3  # shortest stretch that is looked at, and shortest that is taken
 _GAP_S = 0.4  # between two stretches that are looked at as one
-_WEIGHTS = (1.0, 1.0, 0.5)  # silhouette, colour, features: a network may take left for right, too
 _WORSE = 1.08  # of the clip's usual error: from here on a stretch is doubted
 _MOST_SHARE = 0.35  # of a clip that is doubted: beyond that the clip, not the stretch, is at fault
 _ONE_FRAME = 1.5  # of its clip's usual error: what a single frame can say at most
 _APART = 0.08  # units (root mean square over the surface): nearer poses are the same reading
 _LEAST_GAIN = -0.01  # of the usual error; below zero: where pictures do not tell, a pose seen elsewhere is likelier
 _CLEAR_GAIN = 0.02  # ... where nothing was doubted: only that another pose would suit nearly as well
-_JUMP = 0.5  # price in object sizes of misfit of a mean jump of one unit off the course of the known motion
-_POINTS, _MOST_POSES, _MOST_READ, _IMITATED = 160, 400, 2000, 400
+_MOST_POSES, _MOST_READ, _IMITATED = 400, 2000, 400
 _LEVELS = 64  # of excess that are tried
 
 
@@ -68,9 +67,9 @@ def second_thoughts(
         most: frames for which that effort suffices; stretches that are explained worst come first.
         agree: makes processes that share the work decide alike (see :mod:`stages.fitting.team`).
     """
-    before = _errors(figures_of(model, observations))
-    usual = before.nanmedian(0).values.clamp_min(1e-4)
-    error = _relative(before, usual)
+    before = figures_of(model, observations)
+    usual = unexplained(before).nanmedian(0).values.clamp_min(1e-4)
+    error = relative_error(before, usual)
     doubted = worst(doubtful(error, model), error, model, most)
     room = most - int(doubted.sum())
     asked = doubted | drawn(observations, model, _MOST_READ, seed) if room > 0 else doubted
@@ -86,7 +85,7 @@ def second_thoughts(
     same = deepcopy(model)
     for copy in (same, other):
         practise(copy, focus)
-    gain = _relative(_errors(figures_of(same, focus)), usual) - _relative(_errors(figures_of(other, focus)), usual)
+    gain = relative_error(figures_of(same, focus), usual) - relative_error(figures_of(other, focus), usual)
     least = torch.where(doubted, _LEAST_GAIN, _CLEAR_GAIN)
     taken = agree(better(gain - least, looked_at, model).long()) > 0
     left = 0.0
@@ -98,22 +97,10 @@ def second_thoughts(
     return Rethought(int(looked_at.sum()), int(taken.sum()), left)
 
 
-def _errors(figures: FrameFigures) -> Tensor:
-    """(T, 3): what of silhouette, colour and features is not explained; NaN where nothing was compared."""
-    return torch.stack([1 - figures.overlap, figures.colour, figures.feature], 1)
-
-
-def _relative(errors: Tensor, usual: Tensor) -> Tensor:
-    """(T,) weighted mean of errors (T, 3) over what is usual (3,), of those that are known; NaN where none is."""
-    ratio = errors / usual
-    weight = torch.tensor(_WEIGHTS) * ~ratio.isnan()
-    return (ratio.nan_to_num() * weight).sum(1) / torch.where(weight.any(1), weight.sum(1), torch.nan)
-
-
 def doubtful(error: Tensor, model: Banmo) -> Tensor:
     """Frames (T,) of stretches whose error (T,), relative to what is usual, stands out from their clip's."""
     found = torch.zeros(len(error), dtype=torch.bool)
-    for mine, frames_a_second in _clips(model):
+    for mine, frames_a_second in clips(model):
         own = error[mine]
         known = ~own.isnan()
         if int(known.sum()) < 8:
@@ -121,17 +108,17 @@ def doubtful(error: Tensor, model: Banmo) -> Tensor:
         usual = own[known].median()
         # However bad one frame is, it says no more than a bad stretch does.
         told = torch.where(known, own.clamp_max(_ONE_FRAME * usual), 0.0)
-        window = _window(_SMOOTH_S * frames_a_second)
-        smooth = _smoothed(told, known, window).nan_to_num(float(usual))
+        width = window(_SMOOTH_S * frames_a_second)
+        smooth = smoothed(told, known, width).nan_to_num(float(usual))
         bad = smooth > max(_WORSE * float(smooth.median()), float(smooth.quantile(1 - _MOST_SHARE)))
-        joined = bad | (_between(bad) & ~_long_runs(~bad, _GAP_S * frames_a_second))
-        found[mine] = _long_runs(joined, max(_LEAST_S * frames_a_second, window + 1))
+        joined = bad | (between(bad) & ~long_runs(~bad, _GAP_S * frames_a_second))
+        found[mine] = long_runs(joined, max(_LEAST_S * frames_a_second, width + 1))
     return found
 
 
 def worst(frames: Tensor, error: Tensor, model: Banmo, most: int) -> Tensor:
     """Of the stretches in `frames` (T,) those with the largest mean error (T,), about `most` frames in all, as (T,)."""
-    stretches = _runs(torch.nonzero(frames)[:, 0], model)
+    stretches = runs(torch.nonzero(frames)[:, 0], model)
     kept = torch.zeros_like(frames)
     for stretch in sorted(stretches, key=lambda some: -float(error[some].nanmean())):
         if int(kept.sum()) + len(stretch) <= most or not kept.any():
@@ -142,24 +129,13 @@ def worst(frames: Tensor, error: Tensor, model: Banmo, most: int) -> Tensor:
 def better(gain: Tensor, looked_at: Tensor, model: Banmo) -> Tensor:
     """Frames (T,) of stretches long enough whose gain (T,) is above zero, of those that were looked at (T,)."""
     found = torch.zeros(len(gain), dtype=torch.bool)
-    for mine, frames_a_second in _clips(model):
+    for mine, frames_a_second in clips(model):
         known = looked_at[mine] & ~gain[mine].isnan()
         # Only what is known counts: beyond a stretch's ends there is nothing to gain or lose.
-        smooth = _smoothed(gain[mine], known, _window(_GAIN_S * frames_a_second))
+        smooth = smoothed(gain[mine], known, window(_GAIN_S * frames_a_second))
         kept = (smooth > 0) & looked_at[mine]
-        found[mine] = _long_runs(kept, _LEAST_S * frames_a_second)
+        found[mine] = long_runs(kept, _LEAST_S * frames_a_second)
     return found
-
-
-def drawn(observations: Observations, model: Banmo, most: int, seed: int) -> Tensor:
-    """Frames (T,) of stretches that can be seen, drawn at random until there are `most`: all of them in most runs."""
-    chosen = torch.zeros(len(model.time), dtype=torch.bool)
-    seen = torch.nonzero(observations.frame_weight > 0)[:, 0]
-    stretches = [part for run in _runs(seen, model) for part in run.split(most)]
-    for i in torch.randperm(len(stretches), generator=torch.Generator().manual_seed(seed)).tolist():
-        if int(chosen.sum()) + len(stretches[i]) <= most:
-            chosen[stretches[i]] = True
-    return chosen
 
 
 class Readings(NamedTuple):
@@ -180,49 +156,33 @@ def other_readings(model: Banmo, observations: Observations, asked: Tensor) -> R
     if len(asked_frames) == 0 or len(model.surface) == 0:
         return found
     seen = torch.nonzero(observations.frame_weight > 0)[:, 0]
-    known = seen[spread(len(seen), _MOST_POSES)]
-    points = model.surface[spread(len(model.surface), _POINTS)]
-    shapes = known_shapes(model, known, points).cpu()
-    jump = jumps(shapes, known_shapes(model, _next(known, model), points).cpu())
-    for stretch in _runs(asked_frames, model):
-        states = [model.frames(part) for part in stretch.split(64)]
-        poses = (torch.cat([state.camera_from_object for state in states]) @ model.gauge[stretch]).cpu()
-        intrinsics = torch.cat([state.intrinsics for state in states]).cpu()
-        now = known_shapes(model, stretch, points).cpu()
-        cost = misfit(shapes, poses, intrinsics, observations, stretch)
-        own = misfit_of_each(now, poses, intrinsics, observations, stretch)
-        cost[torch.stack([(shapes - shape).square().sum(-1).mean(-1).sqrt() for shape in now]) < _APART] = torch.inf
+    motion = known_motion(model, seen, _MOST_POSES)
+    for stretch in runs(asked_frames, model):
+        laid = lay_over(motion, model, observations, stretch)
+        cost = laid.cost
+        apart = torch.stack([(motion.shapes - shape).square().sum(-1).mean(-1).sqrt() for shape in laid.now])
+        cost[apart < _APART] = torch.inf
         if not bool(torch.isfinite(cost).any(1).all()):
             continue
-        path = best_sequence(cost, jump)
-        found.frame[stretch] = known[path]
-        found.excess[stretch] = (cost.gather(1, path[:, None])[:, 0] - own) / own.median().clamp_min(1e-6)
+        path = best_sequence(cost, motion.jump)
+        found.frame[stretch] = motion.frames[path]
+        found.excess[stretch] = (cost.gather(1, path[:, None])[:, 0] - laid.own) / laid.own.median().clamp_min(1e-6)
     return found
-
-
-def jumps(shapes: Tensor, after: Tensor) -> Tensor:
-    """Price (K, K) of going from one known shape (K, N, 3) to another; `after` (K, N, 3) is what each went on to.
-
-    Going on as the motion went on there costs nothing, resting costs what it moved: motions recur as a whole, and a
-    stretch of one that was seen well elsewhere is likelier than a mix of single poses.
-    """
-    return _JUMP * torch.stack([(shapes - shape).norm(dim=-1).mean(-1) for shape in after])
 
 
 def closest(excess: Tensor, model: Banmo, without: Tensor, most: int) -> Tensor:
     """Frames (T,) of the stretches where `excess` (T,) is least, none of `without` (T,), up to `most` in all."""
     smooth = torch.full_like(excess, torch.inf)
-    clips = _clips(model)
-    for mine, frames_a_second in clips:
+    for mine, frames_a_second in clips(model):
         open_to_it = torch.isfinite(excess[mine]) & ~without[mine]
-        own = _smoothed(excess[mine], open_to_it, _window(_SMOOTH_S * frames_a_second))
+        own = smoothed(excess[mine], open_to_it, window(_SMOOTH_S * frames_a_second))
         smooth[mine] = torch.where(open_to_it, own, torch.inf)
     found = torch.zeros_like(without)
     levels = smooth[torch.isfinite(smooth)].sort().values
     for level in levels[spread(len(levels), _LEVELS)]:
         now = torch.zeros_like(found)
-        for mine, frames_a_second in clips:
-            now[mine] = _long_runs(smooth[mine] <= level, _LEAST_S * frames_a_second)
+        for mine, frames_a_second in clips(model):
+            now[mine] = long_runs(smooth[mine] <= level, _LEAST_S * frames_a_second)
         if int(now.sum()) > most:
             break
         found = now
@@ -240,56 +200,3 @@ def redirect(model: Banmo, wanted: Tensor, ridge: float = 1e-3) -> None:
         mine = slice(model.starts[video], model.starts[video + 1])
         if bool((wanted[mine] >= 0).any()):
             model.body.code.steer(video, model.time[mine], change[mine], ridge)
-
-
-def _clips(model: Banmo) -> list[tuple[slice, float]]:
-    """Where each clip's frames lie, and how many there are a second."""
-    found = []
-    for i, video in enumerate(model.videos):
-        span = max(video.time_s[-1] - video.time_s[0], 1e-3)
-        found.append((slice(model.starts[i], model.starts[i + 1]), max(1.0, (len(video.time_s) - 1) / span)))
-    return found
-
-
-def _next(frames: Tensor, model: Banmo) -> Tensor:
-    """The frame (N,) that follows each of `frames` (N,) in its clip; the last is followed by itself."""
-    last = torch.as_tensor(model.starts)[1:][model.video_idx.cpu()[frames]] - 1
-    return torch.minimum(frames + 1, last)
-
-
-def _window(frames: float) -> int:
-    """An odd number of frames, about so many."""
-    return 2 * round(frames / 2) + 1
-
-
-def _between(flags: Tensor) -> Tensor:
-    """From the first to the last that is set of `flags` (N,)."""
-    return (flags.cumsum(0) > 0) & (flags.flip(0).cumsum(0).flip(0) > 0)
-
-
-def _smoothed(values: Tensor, known: Tensor, width: int) -> Tensor:
-    """Moving mean (N,) over `width` frames, odd, of those `values` (N,) that are known (N,); NaN where none is."""
-    both = torch.stack([torch.where(known, values, 0.0), known.to(values.dtype)])
-    total, share = torch.nn.functional.avg_pool1d(both, width, stride=1, padding=width // 2)
-    return torch.where(share > 0, total / share, torch.nan)
-
-
-def _long_runs(flags: Tensor, frames: float) -> Tensor:
-    """Those of `flags` (N,) of which about so many `frames` at least stand in a row."""
-    least = max(3, round(frames))
-    kept = torch.zeros_like(flags)
-    start = None
-    for i, flag in enumerate([*flags.tolist(), False]):
-        if flag and start is None:
-            start = i
-        elif not flag and start is not None:
-            kept[start:i] = i - start >= least
-            start = None
-    return kept
-
-
-def _runs(frames: Tensor, model: Banmo) -> list[Tensor]:
-    """Frame indices (N,), sorted, cut wherever one is missing or another clip begins."""
-    video = model.video_idx.cpu()[frames]
-    cut = torch.nonzero((frames[1:] != frames[:-1] + 1) | (video[1:] != video[:-1]))[:, 0] + 1
-    return [part for part in torch.tensor_split(frames, cut) if len(part)]

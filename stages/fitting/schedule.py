@@ -122,12 +122,15 @@ class PhaseSettings:
     the masks do not vouch for: specks, and sheets that float where no ray is drawn."""
     mend_from: float = 0.3
     """Share of the phase from which that is done; before, limbs may still grow together."""
+    recur_at: tuple[float, ...] = ()
+    """Shares of the phase at which stretches that may show one motion, a stride and the next, say, are fitted as one to
+    the pictures of both, and go on from there where that explains them nearly as well; empty = never."""
     rethink_at: tuple[float, ...] = ()
     """Shares of the phase at which stretches of motion that are explained badly, or that another motion might explain,
     are read anew: poses of other frames are fitted there, too, and taken where they explain the pictures better;
     empty = never, as are 0 and 1."""
     rethink_share: float = 0.08
-    """Work that goes into one such second thought, as a share of the phase's steps."""
+    """Work that goes into one such second thought, or shared motion, as a share of the phase's steps."""
     reject_at: float = 2.0
     """Share of the phase at which frames that fit far worse than their clip are trusted less and, where root poses are
     free, placed between their neighbours; above 1 = never."""

@@ -20,6 +20,7 @@ from stages.fitting.diagnose import FrameFigures, frame_figures, misfits, replac
 from stages.fitting.evidence import share_on_masks
 from stages.fitting.objective import evaluate
 from stages.fitting.observations import Observations
+from stages.fitting.recurrence import Recurred, share_motion
 from stages.fitting.renew import renew_bones, renew_bounds
 from stages.fitting.rethink import Rethought, second_thoughts
 from stages.fitting.schedule import PhaseSettings, beta_at, rate_at
@@ -29,6 +30,8 @@ from stages.model.banmo import Banmo
 
 _PRACTISED = 40
 """How often a frame is drawn at least while another reading of it is fitted."""
+_PRACTISED_TOGETHER = 19
+"""... and while two stretches are fitted as one motion: each frame has another's pictures, too."""
 
 
 class Diverged(RuntimeError):
@@ -50,6 +53,8 @@ class Trainer:
         self.renewal_error: float | None = None  # units; see renew_bones
         self.rethought: Rethought | None = None
         self.reread = torch.zeros(2, dtype=torch.int64)  # frames looked at and read anew so far
+        self.recurred: Recurred | None = None
+        self.shared = torch.zeros(2, dtype=torch.int64)  # frames that may show one motion with others, and that do
         self.pause: Callable[[], None] = lambda: None  # called during long work between two steps; may raise
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
@@ -130,6 +135,8 @@ class Trainer:
             self.refresh()
         if self.step_idx and self.step_idx == round(s.renew_at * s.iterations):
             self._renew()
+        if self.step_idx and self.step_idx in {round(at * s.iterations) for at in s.recur_at}:
+            self._share_motion()
         if self.step_idx and self.step_idx in {round(at * s.iterations) for at in s.rethink_at}:
             self._rethink()
         if self.step_idx and self.step_idx == round(s.reject_at * s.iterations):
@@ -213,47 +220,87 @@ class Trainer:
 
     def _rethink(self) -> None:
         """Other readings of what is explained badly; the motion's moments start afresh where one is taken."""
-        s = self.settings
-        if s.lr_motion <= 0:
+        if self.settings.lr_motion <= 0:
             return
+        second = self._practice()
+
+        def practise(model: Banmo, seen: Observations) -> None:
+            self._practise(second, model, seen, lambda some, step: None)
+
+        most = second.iterations * second.frames_per_step // _PRACTISED
+        try:
+            told = second_thoughts(
+                self.model, self._trusted(), self._figures_of(second), practise, most, second.seed, self._agree_on
+            )
+        except Diverged:  # a copy did, in every process alike: the model itself is as it was
+            told = Rethought(0, 0, 0.0)
+        self.rethought = told
+        self.reread += torch.tensor([told.looked_at, told.taken])
+        if told.taken:
+            self._motion_changed()
+
+    def _share_motion(self) -> None:
+        """One motion for stretches that show the same; the motion's moments start afresh where any do."""
+        if self.settings.lr_motion <= 0:
+            return
+        second = self._practice()
+
+        def practise(model: Banmo, seen: Observations, between: Callable[[Banmo, int], None]) -> None:
+            self._practise(second, model, seen, between)
+
+        most = second.iterations * second.frames_per_step // _PRACTISED_TOGETHER
+        try:
+            told = share_motion(
+                self.model, self._trusted(), self._figures_of(second), practise, most, second.seed, self._agree_on
+            )
+        except Diverged:
+            told = Recurred(0, 0, 0.0)
+        self.recurred = told
+        self.shared += torch.tensor([told.paired, told.taken])
+        if told.taken:
+            self._motion_changed()
+
+    def _practice(self) -> PhaseSettings:
+        """Settings by which copies of the model are fitted: their motion and nothing else."""
+        s = self.settings
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
         quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
         # Where a pose ends depends on how many steps it makes more than on how many rays each step has.
         few = max(self.team.size, -(-s.frames_per_step // 2))
         rays = {"frames_per_step": few, "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
         steps = max(1, round(3 * s.rethink_share * s.iterations / 2))
-        still = replace(
+        return replace(
             s, **quiet, **rays, iterations=steps, beta_start=beta, beta_end=beta,
             cover_from=0.0, spill_from=0.0, decay_from=0.5, warmup_steps=10, active_share=0.0, flow_only_every=0,
-            renew_at=2.0, reject_at=2.0, rethink_at=(), delta_from=2.0, seed=s.seed + self.step_idx,
+            renew_at=2.0, reject_at=2.0, rethink_at=(), recur_at=(), delta_from=2.0, seed=s.seed + self.step_idx,
         )  # fmt: skip
 
-        def practise(model: Banmo, seen: Observations) -> None:
-            trainer = Trainer(model, seen, still, self.team)
-            trainer.rate_scale = self.rate_scale
-            while not trainer.done:
-                self.pause()
-                trainer.step()
+    def _practise(
+        self, settings: PhaseSettings, model: Banmo, seen: Observations, between: Callable[[Banmo, int], None]
+    ) -> None:
+        trainer = Trainer(model, seen, settings, self.team)
+        trainer.rate_scale = self.rate_scale
+        while not trainer.done:
+            self.pause()
+            trainer.step()
+            between(model, trainer.step_idx)
 
+    def _figures_of(self, settings: PhaseSettings) -> Callable[[Banmo, Observations], FrameFigures]:
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
             self.pause()
-            return frame_figures(model, seen, frame_boxes(model), s, beta, pixels=400)
+            return frame_figures(model, seen, frame_boxes(model), self.settings, settings.beta_start, pixels=400)
 
-        def agree(told: Tensor) -> Tensor:
-            return self.team.agree(told.to(self.device)).cpu()
+        return figures_of
 
-        most = steps * few // _PRACTISED
-        try:
-            told = second_thoughts(self.model, self._trusted(), figures_of, practise, most, still.seed, agree)
-        except Diverged:  # a copy did, in every process alike: the model itself is as it was
-            told = Rethought(0, 0, 0.0)
-        self.rethought = told
-        self.reread += torch.tensor([told.looked_at, told.taken])
-        if told.taken:
-            self._agree()
-            self.refresh()
-            for parameter in self.groups()["motion"][0]:
-                self.optimiser.state.pop(parameter, None)
+    def _agree_on(self, told: Tensor) -> Tensor:
+        """What the first process has, on the CPU, in all of them."""
+        return self.team.agree(told.to(self.device)).cpu()
+
+    def _motion_changed(self) -> None:
+        self._agree()
+        self.refresh()
+        for parameter in self.groups()["motion"][0]:
+            self.optimiser.state.pop(parameter, None)
 
     # ------------------------------------------------------------------------------------------ state
 
@@ -265,6 +312,7 @@ class Trainer:
             out |= {f"uncertainty.{k}": v.clone() for k, v in self.uncertainty.state_dict().items()}
         out["trust"] = self.trust.clone()
         out["reread"] = self.reread.clone()
+        out["shared"] = self.shared.clone()
         out["counters"] = torch.tensor([self.step_idx, int(self.model.use_delta), self.settings.iterations])
         out["rate_scale"] = torch.tensor([self.rate_scale], dtype=torch.float64)
         for g, group in enumerate(self.optimiser.param_groups):
@@ -281,6 +329,7 @@ class Trainer:
         self.model.load_state_dict(tensors)
         self.trust = state["trust"].cpu().clone()
         self.reread = state["reread"].cpu().clone()
+        self.shared = state["shared"].cpu().clone()
         self.boxes = state["boxes"].to(self.device, copy=True)
         self.step_idx = int(state["counters"][0])
         self.model.use_delta = bool(state["counters"][1])

@@ -5,21 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 
-from stages.fitting import rethink, trainer
+from stages.fitting import known_poses, rethink, stretches, trainer
 from stages.fitting.diagnose import FrameFigures
 from stages.fitting.observations import Observations
 from stages.fitting.renew import posed
-from stages.fitting.surface import surface_points
 from stages.fitting.trainer import Trainer
 from stages.geometry.rotations import rigid, so3_exp
-from stages.model.banmo import Banmo, VideoFacts
+from stages.model.banmo import Banmo
 from stages.model.motion import FourierCode
-from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, orbit, scene, stir, tiny_settings
+from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, scene, stir, tiny_settings
+from tests.numerics.moving_body import FRAMES, RADII, codes, moving, observations, solid
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-FRAMES = 40
-RADII = torch.tensor([0.3, 0.2, 0.6])
 
 
 @pytest.fixture(scope="module")
@@ -27,41 +24,10 @@ def seen() -> Scene:
     return scene(ellipsoid(RADII), frames=6)
 
 
-def solid(points: torch.Tensor) -> torch.Tensor:
-    return ((points / RADII).norm(dim=-1) - 1) * float(RADII.min())
-
-
 @pytest.fixture
 def model(seen: Scene) -> Banmo:
     """Two clips of 40 frames, 20 a second, of a body that moves."""
     return moving(seen, 20.0)
-
-
-def moving(seen: Scene, frames_a_second: float) -> Banmo:
-    found = model_of(seen, solid)
-    times = tuple(i / frames_a_second for i in range(FRAMES))
-    videos = [VideoFacts(f"clip{v}", times, 48, 40, (44.0, 44.0), (24.0, 20.0)) for v in range(2)]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        generator = torch.Generator().manual_seed(0)
-        long = Banmo(found.architecture, videos, orbit(2 * FRAMES, 0.0), found.bounds, found.bones, generator)
-    long.field.load_state_dict(found.field.state_dict())
-    stir(long, 1.5)
-    long.surface = surface_points(long, 48)
-    return long
-
-
-def observations(count: int) -> Observations:
-    """Only what says which frames may be used."""
-    empty = torch.zeros(0)
-    return Observations(
-        torch.arange(count) // FRAMES, torch.ones(count), empty, empty, empty, empty, empty,
-        torch.full((count, 32, 32), 255, dtype=torch.uint8), torch.full((count,), 32 / 48), torch.tensor([48.0, 40.0]),
-    )  # fmt: skip
-
-
-def codes(model: Banmo) -> torch.Tensor:
-    return model.body.code(model.video_idx, model.time).detach()
 
 
 def test_a_code_is_steered_where_it_is_told_and_stays_elsewhere() -> None:
@@ -135,7 +101,7 @@ def test_the_other_reading_is_another_pose(model: Banmo) -> None:
     wanted, excess = rethink.other_readings(model, known, asked)
     assert torch.equal(wanted >= 0, asked) and torch.equal(torch.isfinite(excess), asked)
     points = model.surface[:: max(1, len(model.surface) // 160)]
-    shapes = rethink.known_shapes(model, torch.arange(2 * FRAMES), points)
+    shapes = known_poses.known_shapes(model, torch.arange(2 * FRAMES), points)
     apart = (shapes[wanted[asked]] - shapes[asked]).square().sum(-1).mean(-1).sqrt()
     assert float(apart.min()) > 0.9 * rethink._APART
     wide = known.silhouettes.clone()
@@ -170,25 +136,25 @@ def test_what_another_pose_suits_as_well_is_looked_at_though_nothing_stands_out(
 
 def test_a_path_goes_on_as_the_motion_did_and_ends_with_its_clip(model: Banmo) -> None:
     every = torch.arange(2 * FRAMES)
-    after = rethink._next(every, model)
+    after = known_poses.following(every, model)
     assert after[:3].tolist() == [1, 2, 3] and after[[FRAMES - 1, -1]].tolist() == [FRAMES - 1, 2 * FRAMES - 1]
-    shapes = rethink.known_shapes(model, every, model.surface)
-    price = rethink.jumps(shapes, shapes[after])
+    shapes = known_poses.known_shapes(model, every, model.surface)
+    price = known_poses.jumps(shapes, shapes[after])
     assert torch.equal(price.argmin(1), after)
     # A clip whose middle says nothing is read as the course that led from its start to its end.
     cost = torch.full((20, 2 * FRAMES), 0.1)
     cost[0, 50] = cost[-1, 69] = 0.0
-    assert rethink.best_sequence(cost, price).tolist() == list(range(50, 70))
+    assert known_poses.best_sequence(cost, price).tolist() == list(range(50, 70))
 
 
 def test_of_long_collections_some_stretches_are_read(model: Banmo) -> None:
     known = observations(2 * FRAMES)
     known.frame_weight[15:20] = 0
-    every = rethink.drawn(known, model, 999, seed=0)
+    every = stretches.drawn(known, model, 999, seed=0)
     assert torch.equal(every, known.frame_weight > 0)
-    few = rethink.drawn(known, model, 20, seed=0)
+    few = stretches.drawn(known, model, 20, seed=0)
     assert 15 <= few.sum() <= 20 and not (few & ~every).any()
-    assert any(not torch.equal(few, rethink.drawn(known, model, 20, seed)) for seed in range(1, 5))
+    assert any(not torch.equal(few, stretches.drawn(known, model, 20, seed)) for seed in range(1, 5))
 
 
 def test_the_worst_stretches_come_first_if_there_is_no_time_for_all(model: Banmo) -> None:
