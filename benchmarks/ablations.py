@@ -66,6 +66,7 @@ ROWS: dict[str, Row] = {
     "cover": Row(fit={"weight_cover": 0.02}),
     "no-spill": Row(fit={"weight_spill": 0.0}),
     "no-splines": Row(fit={"motion_spacing_s": 0.0}),
+    "no-shared-motion": Row(fit={"recur_at": ()}),
     "no-second-thoughts": Row(fit={"rethink_at": ()}),
     "first-bones": Row(fit={"renew_at": 2.0}),
     "not-mended": Row(every={"mend": False}),
