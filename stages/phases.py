@@ -111,11 +111,11 @@ def _train(
         if team.leads:
             checkpoints.save(trainer.state(), model.describe(), trainer.step_idx, history)
 
-    def pause() -> None:
+    def pause(doing: str) -> None:
         """Second thoughts take a while: nothing is lost but them and the steps since the last checkpoint."""
         if team.any(run.stop_requested, device):
             run.interrupt()
-        run.tick(trainer.step_idx, settings.iterations, "having second thoughts")
+        run.tick(trainer.step_idx, settings.iterations, doing)
 
     if saved is None:
         save()

@@ -32,6 +32,7 @@ _PRACTISED = 40
 """How often a frame is drawn at least while another reading of it is fitted."""
 _PRACTISED_TOGETHER = 19
 """... and while two stretches are fitted as one motion: each frame has another's pictures, too."""
+_RETHINKING, _SHARING = "having second thoughts", "looking for motion that recurs"
 
 
 class Diverged(RuntimeError):
@@ -55,7 +56,7 @@ class Trainer:
         self.reread = torch.zeros(2, dtype=torch.int64)  # frames looked at and read anew so far
         self.recurred: Recurred | None = None
         self.shared = torch.zeros(2, dtype=torch.int64)  # frames that may show one motion with others, and that do
-        self.pause: Callable[[], None] = lambda: None  # called during long work between two steps; may raise
+        self.pause: Callable[[str], None] = lambda doing: None  # called during long work between two steps; may raise
         self.uncertainty: Uncertainty | None = None
         if settings.active_share > 0:
             octaves = model.architecture.octaves
@@ -225,12 +226,18 @@ class Trainer:
         second = self._practice()
 
         def practise(model: Banmo, seen: Observations) -> None:
-            self._practise(second, model, seen, lambda some, step: None)
+            self._practise(second, model, seen, lambda some, step: None, _RETHINKING)
 
         most = second.iterations * second.frames_per_step // _PRACTISED
         try:
             told = second_thoughts(
-                self.model, self._trusted(), self._figures_of(second), practise, most, second.seed, self._agree_on
+                self.model,
+                self._trusted(),
+                self._figures_of(_RETHINKING, second),
+                practise,
+                most,
+                second.seed,
+                self._agree_on,
             )
         except Diverged:  # a copy did, in every process alike: the model itself is as it was
             told = Rethought(0, 0, 0.0)
@@ -246,12 +253,18 @@ class Trainer:
         second = self._practice()
 
         def practise(model: Banmo, seen: Observations, between: Callable[[Banmo, int], None]) -> None:
-            self._practise(second, model, seen, between)
+            self._practise(second, model, seen, between, _SHARING)
 
         most = second.iterations * second.frames_per_step // _PRACTISED_TOGETHER
         try:
             told = share_motion(
-                self.model, self._trusted(), self._figures_of(second), practise, most, second.seed, self._agree_on
+                self.model,
+                self._trusted(),
+                self._figures_of(_SHARING, second),
+                practise,
+                most,
+                second.seed,
+                self._agree_on,
             )
         except Diverged:
             told = Recurred(0, 0, 0.0)
@@ -276,18 +289,23 @@ class Trainer:
         )  # fmt: skip
 
     def _practise(
-        self, settings: PhaseSettings, model: Banmo, seen: Observations, between: Callable[[Banmo, int], None]
+        self,
+        settings: PhaseSettings,
+        model: Banmo,
+        seen: Observations,
+        between: Callable[[Banmo, int], None],
+        doing: str,
     ) -> None:
         trainer = Trainer(model, seen, settings, self.team)
         trainer.rate_scale = self.rate_scale
         while not trainer.done:
-            self.pause()
+            self.pause(doing)
             trainer.step()
             between(model, trainer.step_idx)
 
-    def _figures_of(self, settings: PhaseSettings) -> Callable[[Banmo, Observations], FrameFigures]:
+    def _figures_of(self, doing: str, settings: PhaseSettings) -> Callable[[Banmo, Observations], FrameFigures]:
         def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
-            self.pause()
+            self.pause(doing)
             return frame_figures(model, seen, frame_boxes(model), self.settings, settings.beta_start, pixels=400)
 
         return figures_of
