@@ -62,7 +62,8 @@ class FitSettings(PhaseSettings):
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
     recur_at: tuple[float, ...] = (0.4, 0.65)
     """Shares of the phase at which stretches that may show one motion, a stride and the next, say, are fitted as one to
-    the pictures of both, and go on from there where that explains them nearly as well; empty = never."""
+    the pictures of both, and go on from there where that explains them nearly as well; empty = never, as are 0
+    and 1."""
     rethink_at: tuple[float, ...] = (0.45, 0.7)
     """Shares of the phase at which stretches of motion that are explained badly, or that another motion might explain,
     are read anew: poses of other frames are fitted there, too, and taken where they explain the pictures better;

@@ -133,23 +133,12 @@ def jumps(shapes: Tensor, after: Tensor) -> Tensor:
     return _JUMP * torch.stack([(shapes - shape).norm(dim=-1).mean(-1) for shape in after])
 
 
-class Laid(NamedTuple):
-    """Known motion laid over the masks of a stretch."""
-
-    cost: Tensor  # (T, K) how badly each known pose lies there, as by misfit
-    own: Tensor  # (T,) ... and the pose that was found
-    now: Tensor  # (T, N, 3) that pose
-
-
 @torch.no_grad()
-def lay_over(motion: KnownMotion, model: Banmo, observations: Observations, stretch: Tensor) -> Laid:
-    """Known motion on the frames (T,) of a stretch, at their root poses."""
-    states = [model.frames(part) for part in stretch.split(64)]
-    poses = (torch.cat([state.camera_from_object for state in states]) @ model.gauge[stretch]).cpu()
-    intrinsics = torch.cat([state.intrinsics for state in states]).cpu()
-    now = known_shapes(model, stretch, motion.points).cpu()
-    cost = misfit(motion.shapes, poses, intrinsics, observations, stretch)
-    return Laid(cost, misfit_of_each(now, poses, intrinsics, observations, stretch), now)
+def views(model: Banmo, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Where known shapes are seen from in kept frames (T,): camera_from_object (T, 4, 4) and intrinsics (T, 3, 3)."""
+    states = [model.frames(part) for part in frames.split(64)]
+    poses = torch.cat([state.camera_from_object for state in states]) @ model.gauge[frames]
+    return poses.cpu(), torch.cat([state.intrinsics for state in states]).cpu()
 
 
 def following(frames: Tensor, model: Banmo) -> Tensor:

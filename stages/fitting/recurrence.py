@@ -6,7 +6,7 @@ stretches' pictures at once on a copy of the model, and the motion found so is t
 nearly as well as two free ones do. From there on both are free again: what differs between two strides is fitted, but
 from one start. Not in the paper.
 
-Axes: T all kept frames, K known frames.
+Axes: T all kept frames, N frames of a stretch.
 """
 
 from __future__ import annotations
@@ -20,9 +20,17 @@ import torch
 from torch import Tensor
 
 from stages.fitting.diagnose import FrameFigures, relative_error, unexplained
-from stages.fitting.known_poses import best_sequence, known_motion, lay_over, spread
+from stages.fitting.known_poses import (
+    best_sequence,
+    known_motion,
+    known_shapes,
+    misfit,
+    misfit_of_each,
+    spread,
+    views,
+)
 from stages.fitting.observations import Observations
-from stages.fitting.renew import imitate, posed
+from stages.fitting.renew import imitate, pose_codes, posed, steer_codes
 from stages.fitting.stretches import clips, drawn, runs, smoothed, window
 from stages.model.banmo import Banmo
 
@@ -33,8 +41,7 @@ _SMOOTH_S = 0.6  # over which it is judged whose motion both start from
 _ALIKE = 0.1  # share by which frame rates may differ
 _EVERY = 10  # steps after which both are brought together again
 _TOLERATED = 0.17  # of the usual error: what one motion may explain less than two, each free to follow its own pictures
-_RIDGE = 1e-3  # of codes that are changed
-_MOST_POSES, _MOST_READ, _IMITATED = 400, 2000, 400
+_POINTS, _MOST_POSES, _MOST_READ, _IMITATED = 160, 400, 2000, 400
 
 
 class Recurred(NamedTuple):
@@ -87,7 +94,7 @@ def share_motion(
     if taken.any():
         points = model.surface[spread(len(model.surface), _IMITATED)]
         target = torch.where(taken[:, None, None].to(points.device), posed(together, points), posed(model, points))
-        _steer(model, torch.where(taken[:, None].to(points.device), _codes(together) - _codes(model), 0.0))
+        steer_codes(model, torch.where(taken[:, None].to(points.device), pose_codes(together) - pose_codes(model), 0.0))
         left = imitate(model, points, target, seed, steps=max(200, len(target) // 12))
     return Recurred(int(paired.sum()), int(taken.sum()), left)
 
@@ -123,7 +130,7 @@ def candidates(model: Banmo, observations: Observations, seed: int) -> list[Pair
     video, found = model.video_idx.cpu(), []
     for stretch in runs(torch.nonzero(drawn(observations, model, _MOST_READ, seed))[:, 0], model):
         mine = int(video[stretch[0]])
-        cost = lay_over(motion, model, observations, stretch).cost
+        cost = misfit(motion.shapes, *views(model, stretch), observations, stretch)
         moment = (motion.frames - stretch[:, None]).abs() < _APART_S * float(rates[mine])
         other_pace = (rates[video[motion.frames]] / rates[mine] - 1).abs() >= _ALIKE
         cost[(moment & (video[motion.frames] == mine)) | other_pace] = torch.inf
@@ -158,16 +165,14 @@ def at_one_pace(stretch: Tensor, path: Tensor, video: Tensor, slack: float) -> l
 def suits_both(model: Banmo, observations: Observations, partner: Tensor) -> Tensor:
     """Frames (T,) whose pose suits both masks worse than that of their partner (T,) does."""
     paired = torch.nonzero(partner >= 0)[:, 0]
-    motion = known_motion(model, paired, len(paired))
-    gain = torch.zeros(len(partner))
-    at = torch.full((len(partner),), -1)
-    at[paired] = torch.arange(len(paired))
-    own, other = torch.zeros(len(partner)), torch.zeros(len(partner))
-    for stretch in runs(paired, model):
-        laid = lay_over(motion, model, observations, stretch)
-        own[stretch] = laid.own
-        other[stretch] = laid.cost.gather(1, at[partner[stretch]][:, None])[:, 0]
-    gain[paired] = (own + other[partner.clamp_min(0)] - other - own[partner.clamp_min(0)])[paired]
+    points, view = model.surface[spread(len(model.surface), _POINTS)], views(model, paired)
+    misfits = torch.zeros(2, len(partner))
+    for i, frames in enumerate((paired, partner[paired])):
+        shapes = known_shapes(model, frames, points).cpu()
+        misfits[i, paired] = misfit_of_each(shapes, *view, observations, paired)
+    own, other = misfits
+    back = partner.clamp_min(0)
+    gain = torch.where(partner >= 0, own + other[back] - other - own[back], 0.0)
     worse = torch.zeros(len(partner), dtype=torch.bool)
     for mine, rate in clips(model):
         worse[mine] = smoothed(gain[mine], partner[mine] >= 0, window(_SMOOTH_S * rate)).nan_to_num() > 0
@@ -177,10 +182,10 @@ def suits_both(model: Banmo, observations: Observations, partner: Tensor) -> Ten
 @torch.no_grad()
 def meet(model: Banmo, partner: Tensor, share: Tensor | float = 0.5) -> None:
     """Bring pose codes of frames towards those of their partners (T,), by a share of the way (T,) or one for all."""
-    codes = _codes(model)
+    codes = pose_codes(model)
     way = share[:, None].to(codes.device) if isinstance(share, Tensor) else share
     other = codes[partner.clamp_min(0).to(codes.device)]
-    _steer(model, torch.where((partner >= 0)[:, None].to(codes.device), way * (other - codes), 0.0))
+    steer_codes(model, torch.where((partner >= 0)[:, None].to(codes.device), way * (other - codes), 0.0))
 
 
 def tolerable(gain: Tensor, partner: Tensor, model: Banmo) -> Tensor:
@@ -197,16 +202,3 @@ def tolerable(gain: Tensor, partner: Tensor, model: Banmo) -> Tensor:
 def _least(model: Banmo, frame: int) -> int:
     """Frames that the shortest motion takes in the clip of a frame."""
     return max(6, round(_LEAST_S * clips(model)[int(model.video_idx[frame])][1]))
-
-
-def _codes(model: Banmo) -> Tensor:
-    every = torch.arange(len(model.time), device=model.time.device).split(64)
-    return torch.cat([model.body.code(model.video_idx[some], model.time[some]) for some in every]).detach()
-
-
-def _steer(model: Banmo, change: Tensor) -> None:
-    """Change pose codes by (T, C), where it is not zero."""
-    for video in range(len(model.videos)):
-        mine = slice(model.starts[video], model.starts[video + 1])
-        if bool(change[mine].any()):
-            model.body.code.steer(video, model.time[mine], change[mine], _RIDGE)

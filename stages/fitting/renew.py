@@ -35,6 +35,22 @@ def posed(model: Banmo, points: Tensor, frames: Tensor | None = None) -> Tensor:
     return torch.cat([model.forward_points(model.frames(i), points[None].expand(len(i), -1, -1)) for i in parts])
 
 
+@torch.no_grad()
+def pose_codes(model: Banmo) -> Tensor:
+    """Pose codes (T, C) of all kept frames."""
+    every = torch.arange(len(model.time), device=model.time.device).split(64)
+    return torch.cat([model.body.code(model.video_idx[some], model.time[some]) for some in every])
+
+
+@torch.no_grad()
+def steer_codes(model: Banmo, change: Tensor, ridge: float = 1e-3) -> None:
+    """Change the pose codes of all kept frames by (T, C), as far as each clip's functions of time can (ridge)."""
+    for video in range(len(model.videos)):
+        mine = slice(model.starts[video], model.starts[video + 1])
+        if bool(change[mine].any()):
+            model.body.code.steer(video, model.time[mine], change[mine], ridge)
+
+
 def imitate(model: Banmo, points: Tensor, target: Tensor, seed: int, steps: int = 200) -> float:
     """Fit the bones' motion so that canonical points (N, 3) go where `target` (T, N, 3) has them.
 

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from stages.fitting.diagnose import FrameFigures, relative_error, unexplained
-from stages.fitting.known_poses import best_sequence, known_motion, lay_over, spread
+from stages.fitting.known_poses import best_sequence, known_motion, known_shapes, misfit, misfit_of_each, spread, views
 from stages.fitting.observations import Observations
-from stages.fitting.renew import imitate, posed
+from stages.fitting.renew import imitate, pose_codes, posed, steer_codes
 from stages.fitting.stretches import between, clips, drawn, long_runs, runs, smoothed, window
 from stages.model.banmo import Banmo
 
@@ -158,15 +158,16 @@ def other_readings(model: Banmo, observations: Observations, asked: Tensor) -> R
     seen = torch.nonzero(observations.frame_weight > 0)[:, 0]
     motion = known_motion(model, seen, _MOST_POSES)
     for stretch in runs(asked_frames, model):
-        laid = lay_over(motion, model, observations, stretch)
-        cost = laid.cost
-        apart = torch.stack([(motion.shapes - shape).square().sum(-1).mean(-1).sqrt() for shape in laid.now])
+        view, now = views(model, stretch), known_shapes(model, stretch, motion.points).cpu()
+        cost = misfit(motion.shapes, *view, observations, stretch)
+        apart = torch.stack([(motion.shapes - shape).square().sum(-1).mean(-1).sqrt() for shape in now])
         cost[apart < _APART] = torch.inf
         if not bool(torch.isfinite(cost).any(1).all()):
             continue
         path = best_sequence(cost, motion.jump)
         found.frame[stretch] = motion.frames[path]
-        found.excess[stretch] = (cost.gather(1, path[:, None])[:, 0] - laid.own) / laid.own.median().clamp_min(1e-6)
+        own = misfit_of_each(now, *view, observations, stretch)
+        found.excess[stretch] = (cost.gather(1, path[:, None])[:, 0] - own) / own.median().clamp_min(1e-6)
     return found
 
 
@@ -189,14 +190,8 @@ def closest(excess: Tensor, model: Banmo, without: Tensor, most: int) -> Tensor:
     return found
 
 
-@torch.no_grad()
-def redirect(model: Banmo, wanted: Tensor, ridge: float = 1e-3) -> None:
+def redirect(model: Banmo, wanted: Tensor) -> None:
     """Give frames the pose codes of others: frame t that of frame ``wanted[t]`` (T,); where it is -1, its own."""
-    wanted = wanted.to(model.time.device)
-    every = torch.arange(len(model.time), device=model.time.device).split(64)
-    codes = torch.cat([model.body.code(model.video_idx[some], model.time[some]) for some in every])
-    change = torch.where((wanted >= 0)[:, None], codes[wanted.clamp_min(0)] - codes, 0.0)
-    for video in range(len(model.videos)):
-        mine = slice(model.starts[video], model.starts[video + 1])
-        if bool((wanted[mine] >= 0).any()):
-            model.body.code.steer(video, model.time[mine], change[mine], ridge)
+    codes = pose_codes(model)
+    wanted = wanted.to(codes.device)
+    steer_codes(model, torch.where((wanted >= 0)[:, None], codes[wanted.clamp_min(0)] - codes, 0.0))

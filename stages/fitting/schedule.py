@@ -124,7 +124,8 @@ class PhaseSettings:
     """Share of the phase from which that is done; before, limbs may still grow together."""
     recur_at: tuple[float, ...] = ()
     """Shares of the phase at which stretches that may show one motion, a stride and the next, say, are fitted as one to
-    the pictures of both, and go on from there where that explains them nearly as well; empty = never."""
+    the pictures of both, and go on from there where that explains them nearly as well; empty = never, as are 0
+    and 1."""
     rethink_at: tuple[float, ...] = ()
     """Shares of the phase at which stretches of motion that are explained badly, or that another motion might explain,
     are read anew: poses of other frames are fitted there, too, and taken where they explain the pictures better;

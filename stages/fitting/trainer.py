@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -32,7 +33,8 @@ _PRACTISED = 40
 """How often a frame is drawn at least while another reading of it is fitted."""
 _PRACTISED_TOGETHER = 19
 """... and while two stretches are fitted as one motion: each frame has another's pictures, too."""
-_RETHINKING, _SHARING = "having second thoughts", "looking for motion that recurs"
+
+Told = TypeVar("Told", Rethought, Recurred)
 
 
 class Diverged(RuntimeError):
@@ -136,10 +138,11 @@ class Trainer:
             self.refresh()
         if self.step_idx and self.step_idx == round(s.renew_at * s.iterations):
             self._renew()
-        if self.step_idx and self.step_idx in {round(at * s.iterations) for at in s.recur_at}:
-            self._share_motion()
-        if self.step_idx and self.step_idx in {round(at * s.iterations) for at in s.rethink_at}:
-            self._rethink()
+        if self.step_idx and s.lr_motion > 0:
+            if self.step_idx in {round(at * s.iterations) for at in s.recur_at}:
+                self._share_motion()
+            if self.step_idx in {round(at * s.iterations) for at in s.rethink_at}:
+                self._rethink()
         if self.step_idx and self.step_idx == round(s.reject_at * s.iterations):
             self._reject()
         if self.progress >= s.delta_from:
@@ -220,60 +223,51 @@ class Trainer:
         self.optimiser = self._optimiser()
 
     def _rethink(self) -> None:
-        """Other readings of what is explained badly; the motion's moments start afresh where one is taken."""
-        if self.settings.lr_motion <= 0:
-            return
-        second = self._practice()
-
-        def practise(model: Banmo, seen: Observations) -> None:
-            self._practise(second, model, seen, lambda some, step: None, _RETHINKING)
-
-        most = second.iterations * second.frames_per_step // _PRACTISED
-        try:
-            told = second_thoughts(
-                self.model,
-                self._trusted(),
-                self._figures_of(_RETHINKING, second),
-                practise,
-                most,
-                second.seed,
-                self._agree_on,
-            )
-        except Diverged:  # a copy did, in every process alike: the model itself is as it was
-            told = Rethought(0, 0, 0.0)
-        self.rethought = told
-        self.reread += torch.tensor([told.looked_at, told.taken])
-        if told.taken:
-            self._motion_changed()
+        """Other readings of what may have been misread."""
+        told = self._look_back(second_thoughts, _PRACTISED, "having second thoughts")
+        self.rethought = told or Rethought(0, 0, 0.0)
+        self.reread += torch.tensor(self.rethought[:2])
 
     def _share_motion(self) -> None:
-        """One motion for stretches that show the same; the motion's moments start afresh where any do."""
-        if self.settings.lr_motion <= 0:
-            return
-        second = self._practice()
+        """One motion for stretches that show the same."""
+        told = self._look_back(share_motion, _PRACTISED_TOGETHER, "looking for motion that recurs")
+        self.recurred = told or Recurred(0, 0, 0.0)
+        self.shared += torch.tensor(self.recurred[:2])
 
-        def practise(model: Banmo, seen: Observations, between: Callable[[Banmo, int], None]) -> None:
-            self._practise(second, model, seen, between, _SHARING)
+    def _look_back(self, look: Callable[..., Told], practised: int, doing: str) -> Told | None:
+        """Change motion by what copies of the model tell, of which motion alone is fitted; None where a copy diverges.
 
-        most = second.iterations * second.frames_per_step // _PRACTISED_TOGETHER
+        The motion's moments start afresh where it was changed. `practised` is how often each frame is drawn at least.
+        """
+        settings = self._motion_alone()
+
+        def practise(
+            model: Banmo, seen: Observations, between: Callable[[Banmo, int], None] = lambda some, step: None
+        ) -> None:
+            trainer = Trainer(model, seen, settings, self.team)
+            trainer.rate_scale = self.rate_scale
+            while not trainer.done:
+                self.pause(doing)
+                trainer.step()
+                between(model, trainer.step_idx)
+
+        def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
+            self.pause(doing)
+            return frame_figures(model, seen, frame_boxes(model), self.settings, settings.beta_start, pixels=400)
+
+        most = settings.iterations * settings.frames_per_step // practised
         try:
-            told = share_motion(
-                self.model,
-                self._trusted(),
-                self._figures_of(_SHARING, second),
-                practise,
-                most,
-                second.seed,
-                self._agree_on,
-            )
-        except Diverged:
-            told = Recurred(0, 0, 0.0)
-        self.recurred = told
-        self.shared += torch.tensor([told.paired, told.taken])
+            told = look(self.model, self._trusted(), figures_of, practise, most, settings.seed, self._agree_on)
+        except Diverged:  # a copy did, in every process alike: the model itself is as it was
+            return None
         if told.taken:
-            self._motion_changed()
+            self._agree()
+            self.refresh()
+            for parameter in self.groups()["motion"][0]:
+                self.optimiser.state.pop(parameter, None)
+        return told
 
-    def _practice(self) -> PhaseSettings:
+    def _motion_alone(self) -> PhaseSettings:
         """Settings by which copies of the model are fitted: their motion and nothing else."""
         s = self.settings
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
@@ -288,37 +282,9 @@ class Trainer:
             renew_at=2.0, reject_at=2.0, rethink_at=(), recur_at=(), delta_from=2.0, seed=s.seed + self.step_idx,
         )  # fmt: skip
 
-    def _practise(
-        self,
-        settings: PhaseSettings,
-        model: Banmo,
-        seen: Observations,
-        between: Callable[[Banmo, int], None],
-        doing: str,
-    ) -> None:
-        trainer = Trainer(model, seen, settings, self.team)
-        trainer.rate_scale = self.rate_scale
-        while not trainer.done:
-            self.pause(doing)
-            trainer.step()
-            between(model, trainer.step_idx)
-
-    def _figures_of(self, doing: str, settings: PhaseSettings) -> Callable[[Banmo, Observations], FrameFigures]:
-        def figures_of(model: Banmo, seen: Observations) -> FrameFigures:
-            self.pause(doing)
-            return frame_figures(model, seen, frame_boxes(model), self.settings, settings.beta_start, pixels=400)
-
-        return figures_of
-
     def _agree_on(self, told: Tensor) -> Tensor:
         """What the first process has, on the CPU, in all of them."""
         return self.team.agree(told.to(self.device)).cpu()
-
-    def _motion_changed(self) -> None:
-        self._agree()
-        self.refresh()
-        for parameter in self.groups()["motion"][0]:
-            self.optimiser.state.pop(parameter, None)
 
     # ------------------------------------------------------------------------------------------ state
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from stages.fitting.observations import Observations
 from stages.fitting.surface import surface_points
+from stages.fitting.trainer import Trainer
 from stages.model.banmo import Banmo, VideoFacts
-from tests.numerics.analytic_scene import Scene, model_of, orbit, stir
+from tests.numerics.analytic_scene import Scene, model_of, orbit, stir, tiny_settings
 
 FRAMES = 40
 RADII = torch.tensor([0.3, 0.2, 0.6])
@@ -42,3 +45,26 @@ def observations(count: int) -> Observations:
 
 def codes(model: Banmo) -> torch.Tensor:
     return model.body.code(model.video_idx, model.time).detach()
+
+
+def resumes_exactly(seen: Scene, looks_back: str, **settings: Any) -> Trainer:
+    """A phase of six steps that looks back after the third, resumed before and after it; returns it when it is done."""
+
+    def start() -> Trainer:
+        model = model_of(seen, solid)
+        stir(model, 1.0)
+        return Trainer(model, seen.observations, tiny_settings(iterations=6, rethink_share=0.7, **settings))
+
+    one, states = start(), []
+    while not one.done:
+        assert (getattr(one, looks_back) is not None) == (one.step_idx > 3)
+        states.append(one.state())
+        one.step()
+    for at in (3, 4):
+        two = start()
+        two.restore(states[at])
+        while not two.done:
+            two.step()
+        for name, value in two.state().items():
+            assert torch.equal(value, one.state()[name]), name
+    return one

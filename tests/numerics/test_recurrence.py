@@ -14,7 +14,7 @@ from stages.fitting.trainer import Trainer
 from stages.geometry.cameras import project, transform
 from stages.model.banmo import Banmo
 from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, scene, stir, tiny_settings
-from tests.numerics.moving_body import FRAMES, RADII, codes, moving, observations, solid
+from tests.numerics.moving_body import FRAMES, RADII, codes, moving, observations, resumes_exactly, solid
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -186,26 +186,8 @@ def test_a_phase_shares_motion_at_its_times_and_resumes_exactly(seen: Scene, mon
     monkeypatch.setattr(recurrence, "recurring", lambda *_: partner)
     monkeypatch.setattr(recurrence, "_TOLERATED", 1e9)
     monkeypatch.setattr(recurrence, "_EVERY", 1)
-    settings = tiny_settings(iterations=6, recur_at=(0.5,), rethink_share=0.7)
-
-    def start() -> Trainer:
-        model = model_of(seen, solid)
-        stir(model, 1.0)
-        return Trainer(model, seen.observations, settings)
-
-    one, states = start(), []
-    while not one.done:
-        assert (one.recurred is not None) == (one.step_idx > 3)
-        states.append(one.state())
-        one.step()
-    assert one.recurred is not None and one.recurred.taken == 12 and one.shared.tolist() == [12, 12]
-    for at in (3, 4):
-        two = start()
-        two.restore(states[at])
-        while not two.done:
-            two.step()
-        for name, value in two.state().items():
-            assert torch.equal(value, one.state()[name]), name
+    done = resumes_exactly(seen, "recurred", recur_at=(0.5,))
+    assert done.recurred is not None and done.recurred.taken == 12 and done.shared.tolist() == [12, 12]
 
 
 def test_what_diverges_leaves_the_model_as_it_was(seen: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,11 @@ from stages.fitting import known_poses, rethink, stretches, trainer
 from stages.fitting.diagnose import FrameFigures
 from stages.fitting.observations import Observations
 from stages.fitting.renew import posed
-from stages.fitting.trainer import Trainer
 from stages.geometry.rotations import rigid, so3_exp
 from stages.model.banmo import Banmo
 from stages.model.motion import FourierCode
-from tests.numerics.analytic_scene import Scene, ellipsoid, model_of, scene, stir, tiny_settings
-from tests.numerics.moving_body import FRAMES, RADII, codes, moving, observations, solid
+from tests.numerics.analytic_scene import Scene, ellipsoid, scene
+from tests.numerics.moving_body import FRAMES, RADII, codes, moving, observations, resumes_exactly
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -224,24 +223,6 @@ def test_a_phase_thinks_again_at_its_times_and_resumes_exactly(seen: Scene, monk
     monkeypatch.setattr(rethink, "_LEAST_GAIN", -1e9)
     monkeypatch.setattr(rethink, "_APART", 1e-3)
     monkeypatch.setattr(trainer, "_PRACTISED", 1)
-    settings = tiny_settings(iterations=6, rethink_at=(0.5,), rethink_share=0.7)
-
-    def start() -> Trainer:
-        model = model_of(seen, solid)
-        stir(model, 1.0)
-        return Trainer(model, seen.observations, settings)
-
-    one, states = start(), []
-    while not one.done:
-        assert (one.rethought is not None) == (one.step_idx > 3)
-        states.append(one.state())
-        one.step()
-    assert one.rethought is not None and one.rethought.taken > 0
-    assert one.reread.tolist() == [one.rethought.looked_at, one.rethought.taken]
-    for at in (3, 4):
-        two = start()
-        two.restore(states[at])
-        while not two.done:
-            two.step()
-        for name, value in two.state().items():
-            assert torch.equal(value, one.state()[name]), name
+    done = resumes_exactly(seen, "rethought", rethink_at=(0.5,))
+    assert done.rethought is not None and done.rethought.taken > 0
+    assert done.reread.tolist() == [done.rethought.looked_at, done.rethought.taken]

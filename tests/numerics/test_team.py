@@ -16,7 +16,7 @@ import torch
 from pipeline import BadInput, Interrupted, Run
 from stages import phases
 from stages.checkpoint import Checkpoints
-from stages.fitting import rethink
+from stages.fitting import recurrence, rethink
 from stages.fitting import trainer as training
 from stages.fitting.batches import Draws, draw, step_generator
 from stages.fitting.team import ALONE, Team, joined
@@ -43,14 +43,18 @@ def train(team: Team) -> tuple[list[dict[str, float]], dict[str, torch.Tensor]]:
 
 
 def think(team: Team) -> tuple[list[float], dict[str, torch.Tensor]]:
-    """Second thoughts about every frame, whatever the poses are."""
+    """One motion for both clips, and second thoughts about every frame, whatever the poses are."""
+    recurrence.recurring = lambda *_: torch.tensor([*range(4, 8), *range(4)])  # type: ignore[assignment]
+    recurrence._TOLERATED, recurrence._EVERY = 9.0, 1
     rethink.doubtful = lambda error, model: torch.ones(len(error), dtype=torch.bool)  # type: ignore[assignment]
     rethink._APART, rethink._LEAST_GAIN, training._PRACTISED = 1e-4, -9.0, 1
     settings = replace(SETTINGS, rethink_share=0.6)
     trainer = Trainer(first_model(), scene(sphere(0.5), frames=4).observations, settings, team)
+    trainer._share_motion()
+    assert trainer.recurred is not None and trainer.recurred.taken == 8
     trainer._rethink()
     assert trainer.rethought is not None
-    return list(trainer.rethought), trainer.state()
+    return [*trainer.recurred, *trainer.rethought], trainer.state()
 
 
 def phase(rank: int, size: int, folder: Path, stop_at: int | None) -> str:
@@ -160,7 +164,7 @@ def test_two_processes_lose_what_one_loses(members: list[dict[str, Any]]) -> Non
 def test_two_processes_think_alike(members: list[dict[str, Any]]) -> None:
     first, second = members
     assert first["thoughts"] == second["thoughts"]
-    looked_at, taken, _ = first["thoughts"]
+    looked_at, taken, _ = first["thoughts"][3:]
     assert looked_at >= 4 and taken >= 3
     for name, value in first["state_after"].items():
         assert torch.equal(value, second["state_after"][name]), name
