@@ -104,19 +104,33 @@ def recurring(model: Banmo, observations: Observations, most: int, seed: int) ->
     """The frame that may show the same moment of a motion as each (T,), and -1 where none does; mutual.
 
     Where a path through the known motions follows one of them at its own pace for long enough, over masks of another
-    stretch, the two may be one motion. Long stretches come first, up to about `most` frames in all.
+    stretch, the two may be one motion. Those that are furthest apart now come first, up to `most` frames in all: what
+    is alike already has little to gain.
     """
+    pairs = contested(candidates(model, observations, seed), model)
+    points = model.surface[spread(len(model.surface), _POINTS)]
+    apart = [known_shapes(model, pair.first, points) - known_shapes(model, pair.second, points) for pair in pairs]
+    gap = [float(some.square().sum(-1).mean(-1).sqrt().sum()) for some in apart]
     partner = torch.full((len(model.time),), -1)
-    pairs = candidates(model, observations, seed)
+    for i in sorted(range(len(pairs)), key=lambda i: -gap[i]):
+        room = (most - int((partner >= 0).sum())) // 2
+        first, second = (side[:room] for side in pairs[i])
+        if len(first) >= _least(model, int(pairs[i].first[0])):
+            partner[first], partner[second] = second, first
+    return partner
+
+
+def contested(pairs: list[Pair], model: Banmo) -> list[Pair]:
+    """Pairs of which each frame is in one at most: the longest come first."""
+    free, found = torch.ones(len(model.time), dtype=torch.bool), []
     for pair in sorted(pairs, key=lambda some: -len(some.first)):
-        free = (partner[pair.first] < 0) & (partner[pair.second] < 0)
-        if int((partner >= 0).sum()) + 2 * int(free.sum()) > most and bool((partner >= 0).any()):
-            continue
-        for part in runs(pair.first[free], model):
+        both = free[pair.first] & free[pair.second]
+        for part in runs(pair.first[both], model):
             second = pair.second[torch.isin(pair.first, part)]
             if len(part) >= _least(model, int(part[0])) and not bool(torch.isin(part, second).any()):
-                partner[part], partner[second] = second, part
-    return partner
+                found.append(Pair(part, second))
+                free[part] = free[second] = False
+    return found
 
 
 def candidates(model: Banmo, observations: Observations, seed: int) -> list[Pair]:

@@ -109,7 +109,19 @@ def test_long_motions_come_first_each_frame_once_and_none_with_itself(
     assert every[42:72].tolist() == list(range(30))
     assert (every[[*range(30, 42), *range(72, 80)]] < 0).all()
     few = recurrence.recurring(model, observations(2 * FRAMES), most=30, seed=0)
-    assert (few >= 0).sum() == 60  # the first is taken whatever it takes
+    assert torch.nonzero(few >= 0)[:, 0].tolist() == [*range(15), *range(42, 57)]  # as much of it as there is room for
+    assert (recurrence.recurring(model, observations(2 * FRAMES), most=8, seed=0) < 0).all()
+
+
+def test_what_is_furthest_apart_comes_first(model: Banmo, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Pair(torch.arange(0, 20), torch.arange(40, 60)), Pair(torch.arange(20, 36), torch.arange(62, 78))]
+    monkeypatch.setattr(recurrence, "candidates", lambda *_: found)
+    was = codes(model)
+    change = torch.zeros(FRAMES, was.shape[1])
+    change[:20] = was[:20] - was[40:60]
+    model.body.code.steer(1, model.time[FRAMES:], change, ridge=1e-4)
+    partner = recurrence.recurring(model, observations(2 * FRAMES), most=32, seed=0)
+    assert torch.equal(partner[20:36], torch.arange(62, 78)) and (partner[:20] < 0).all()
 
 
 def test_partners_meet_half_way_and_others_stay(model: Banmo) -> None:
