@@ -60,7 +60,7 @@ class FitSettings(PhaseSettings):
     """Room for limbs around the first hull (object about 2 long)."""
     renew_at: float = 0.3
     """Share of the phase at which bones and box are placed anew on the current shape, keeping the motion; 2 = never."""
-    recur_at: tuple[float, ...] = (0.4, 0.65)
+    recur_at: tuple[float, ...] = (0.35, 0.5, 0.65, 0.8)
     """Shares of the phase at which stretches that may show one motion, a stride and the next, say, are fitted as one to
     the pictures of both, and go on from there where that explains them nearly as well; empty = never, as are 0
     and 1."""
