@@ -74,7 +74,7 @@ def share_motion(
         figures_of: how well a model explains each frame with weight.
         practise: fits the motion of a model, and nothing else, to the frames with weight; the same effort each time;
             calls what it is given after every step, with the model and the number of steps made.
-        most: frames for which that effort suffices; long stretches come first.
+        most: frames for which that effort suffices; those that are furthest apart come first.
         agree: makes processes that share the work decide alike (see :mod:`stages.fitting.team`).
     """
     partner = agree(recurring(model, observations, most, seed))
@@ -107,7 +107,7 @@ def recurring(model: Banmo, observations: Observations, most: int, seed: int) ->
     stretch, the two may be one motion. Those that are furthest apart now come first, up to `most` frames in all: what
     is alike already has little to gain.
     """
-    pairs = contested(candidates(model, observations, seed), model)
+    pairs = uncontested(candidates(model, observations, seed), model)
     points = model.surface[spread(len(model.surface), _POINTS)]
     apart = [known_shapes(model, pair.first, points) - known_shapes(model, pair.second, points) for pair in pairs]
     gap = [float(some.square().sum(-1).mean(-1).sqrt().sum()) for some in apart]
@@ -120,8 +120,8 @@ def recurring(model: Banmo, observations: Observations, most: int, seed: int) ->
     return partner
 
 
-def contested(pairs: list[Pair], model: Banmo) -> list[Pair]:
-    """Pairs of which each frame is in one at most: the longest come first."""
+def uncontested(pairs: list[Pair], model: Banmo) -> list[Pair]:
+    """Pairs that share no frame: where some want the same ones, the longest have them."""
     free, found = torch.ones(len(model.time), dtype=torch.bool), []
     for pair in sorted(pairs, key=lambda some: -len(some.first)):
         both = free[pair.first] & free[pair.second]
