@@ -1,9 +1,10 @@
 """Root poses that jitter from frame to frame, made steady: what no camera and no animal does in a fiftieth of a second.
 
-Whoever films goes around the subject and hardly rolls or climbs. So a track of rotations is taken apart into where the
-axis points that the camera goes around (in camera space, nearly still), and how far it has gone around it. Each of
-them, and the translation, follows the likeliest smooth course (`stages.registration.courses`); where that leaves no
-noise, poses move smoothly as they are and are left alone.
+Whoever films goes around the subject and hardly rolls or climbs. So a track of rotations is taken apart into how the
+axis that the camera goes around leans in its pictures (towards it and aside, each nearly still), and how far it has
+gone around it. Each of them, and the translation, follows the likeliest smooth course (`stages.registration.courses`),
+where clips that seem filmed alike tell of each other; where that leaves no noise, poses move smoothly as they are and
+are left alone.
 
 Courses are sought from robust local lines through the poses, which tell what goes around how often, and single frames
 that are far off, which are drawn nearer. How far a local line reaches is chosen by leaving each frame out and
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.registration.courses import Basis, Courses, basis, smooth
+from stages.registration.courses import Basis, Courses, basis, smooth, smooth_alike
 
 REACHES_S = (0.05, 0.1, 0.2, 0.35, 0.6, 0.9, 1.4, 2.2, 5.0)
 """Reaches of local lines that are tried: standard deviations of the Gaussian neighbourhood, seconds."""
@@ -26,6 +27,7 @@ _FEWEST = 8
 _NOTHING = 2e-3  # radians or units: no jitter that matters
 _ROUNDS = 6
 _FINISHES = 3  # times the likeliest course is sought, each time from where the last one lies
+_NEAR = 0.9  # cosine: what is nearer to an axis has no longitude about it that is worth the name
 _FAR = 2.0  # of the mean residual: what is further off counts in proportion less (Huber)
 
 
@@ -56,12 +58,16 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> Steadied:
     bases = [basis(time) for time in times]
     seen = [tracks[i][:, :3, :3] for i in long]
     axis = main_axis(seen)
-    turns, around, tilts = _smooth_turns(seen, _turns_by_lines(seen, axis, times), axis, bases)
-    jitter_rad = _told(max(around.noise, tilts.noise))
+    turns, around, *tilts = _smooth_turns(seen, _turns_by_lines(seen, axis, times), axis, bases)
+    jitter_rad = _told(max(around.noise, *(tilt.noise for tilt in tilts)))
     if jitter_rad:
-        for i, turn, about, aslant in zip(long, turns, around.left, tilts.left, strict=True):
+        for k, (i, turn) in enumerate(zip(long, turns, strict=True)):
             out[i][:, :3, :3] = turn
-            off = np.sqrt(about**2 * axis**2 + aslant**2 * (1 - axis**2))
+            # A tilt that stays in camera space is none that a clip's frames share in object space, as far as the
+            # camera goes around.
+            shared = np.abs(np.exp(1j * around.made[k]).mean()) ** 2
+            tilted = [tilt.left[k] ** 2 + (1 - shared) * tilt.left_mean[k] ** 2 for tilt in tilts]
+            off = np.sqrt(around.left[k] ** 2 * axis**2 + np.mean(tilted) * (1 - axis**2))
             wave[i] = (float(off[0]), float(off[1]), float(off[2]))
     seen = [tracks[i][:, :3, 3] for i in long]
     made = _by_lines(seen, times, _places, _distance)
@@ -166,10 +172,10 @@ def _places(seen: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 def _smooth_turns(
     seen: list[np.ndarray], made: list[np.ndarray], axis: np.ndarray, bases: list[Basis]
-) -> tuple[list[np.ndarray], Courses, Courses]:
+) -> tuple[list[np.ndarray], Courses, Courses, Courses]:
     """Rotations (T, 3, 3) `seen` on smooth courses, from those `made` so far; the way around `axis`, and its tilts.
 
-    Both are read off the turn from what is made to what is seen: a tilt that is far off is none around the axis.
+    All are read off the turn from what is made to what is seen: a tilt that is far off is none around the axis.
     """
     for _ in range(_FINISHES):
         gaps = _bounded([_rotvec(now.transpose(0, 2, 1) @ one) for one, now in zip(seen, made, strict=True)])
@@ -179,30 +185,44 @@ def _smooth_turns(
             np.unwrap(_rotvec(frame.transpose(0, 2, 1) @ now) @ axis) + gap @ axis
             for frame, now, gap in zip(frames, made, gaps, strict=True)
         ]
-        around = smooth([way[:, None] for way in ways], bases)
-        tilted = [
-            point + np.cross((now @ gap[..., None])[..., 0], point)
-            for now, gap, point in zip(made, gaps, points, strict=True)
+        around = smooth_alike([way[:, None] for way in ways], bases, paced=True)
+        moves = [
+            np.cross((now @ gap[..., None])[..., 0], point) for now, gap, point in zip(made, gaps, points, strict=True)
         ]
-        aside, tilts = _smooth_directions(points, tilted, bases)
+        aside, towards, across = _smooth_directions(points, moves, bases)
         made = [
             _turned_onto(point, moved) @ frame @ _spin(axis, way[:, 0])
             for frame, point, moved, way in zip(frames, points, aside, around.made, strict=True)
         ]
-    return made, around, tilts
+    return made, around, towards, across
 
 
 def _smooth_directions(
-    points: list[np.ndarray], moved: list[np.ndarray], bases: list[Basis]
-) -> tuple[list[np.ndarray], Courses]:
-    """Directions (T, 3) along `moved`, each clip's in the plane that touches the sphere in the middle of `points`."""
-    middles = [_unit(point.mean(0)) for point in points]
-    planes = [np.linalg.svd(middle[None])[2][1:].T for middle in middles]  # (3, 2)
-    courses = smooth([one @ plane for one, plane in zip(moved, planes, strict=True)], bases)
-    return [
-        _unit(middle * np.sqrt(np.maximum(1 - (course**2).sum(1, keepdims=True), 0)) + course @ plane.T)
-        for course, middle, plane in zip(courses.made, middles, planes, strict=True)
-    ], courses
+    points: list[np.ndarray], moves: list[np.ndarray], bases: list[Basis]
+) -> tuple[list[np.ndarray], Courses, Courses]:
+    """Directions (T, 3) through `points` that are moved by `moves` (T, 3), and their courses as latitude and longitude.
+
+    About the camera's z axis: how an upright axis leans towards the camera, and aside. About its x axis where
+    directions come near z.
+    """
+    nearest = np.abs(np.concatenate(points)).max(0)
+    order = [0, 1, 2] if nearest[2] <= max(nearest[0], _NEAR) else [2, 1, 0]
+    latitudes, longitudes = [], []
+    for point, move in zip(points, moves, strict=True):
+        x, y, z = point[:, order].T
+        flat = np.hypot(x, y)
+        dx, dy, dz = move[:, order].T
+        latitudes.append((np.arctan2(z, flat) + dz / flat)[:, None])
+        longitudes.append((np.unwrap(np.arctan2(x, -y)) + (x * dy - y * dx) / flat**2)[:, None])
+    usual = longitudes[0].mean()
+    longitudes = [one - 2 * np.pi * np.round((one.mean() - usual) / (2 * np.pi)) for one in longitudes]
+    towards, across = smooth_alike(latitudes, bases), smooth_alike(longitudes, bases)
+    made = []
+    for latitude, longitude in zip(towards.made, across.made, strict=True):
+        flat = np.cos(latitude)
+        point = np.concatenate([flat * np.sin(longitude), -flat * np.cos(longitude), np.sin(latitude)], 1)
+        made.append(point[:, order])
+    return made, towards, across
 
 
 def _bounded(gaps: list[np.ndarray]) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.registration import courses
-from stages.registration.courses import basis, smooth
+from stages.registration.courses import basis, smooth, smooth_alike
 
 
 def wandering(rng: np.random.Generator, time: np.ndarray, length: float, size: float) -> np.ndarray:
@@ -63,3 +63,69 @@ def test_the_course_is_that_of_the_dense_formula(monkeypatch: pytest.MonkeyPatch
     square = np.trace(value.T @ (inverse @ (value - line @ slope))) / (3 * 18)
     assert found.noise == pytest.approx(np.sqrt(square))
     assert found.left[0] == pytest.approx(np.sqrt(square * np.trace(centred @ left @ centred) / 20), rel=1e-3)
+
+
+@pytest.mark.parametrize("paced", [False, True])
+def test_courses_that_are_alike_are_those_of_the_dense_formula(monkeypatch: pytest.MonkeyPatch, paced: bool) -> None:
+    """Everything that is not known of a line has a covariance far larger than all else."""
+    for name, one in (("LENGTHS_S", (0.7,)), ("SWINGS", (1.5,)), ("SPREADS", (0.8,))):
+        monkeypatch.setattr(courses, name, one)
+    rng = np.random.default_rng(3)
+    times = [np.linspace(0, length, 15) for length in (2.0, 3.0)]
+    bases = [basis(time) for time in times]
+    slopes = (3.0, -2.0) if paced else (0.1, -0.1)
+    values = [rng.normal(size=15) + slope * (time - time.mean()) for time, slope in zip(times, slopes, strict=True)]
+    wander = [1.5**2 * np.exp(-0.5 * ((time[:, None] - time[None]) / 0.7) ** 2) for time in times]
+    blocks = np.zeros((30, 30))
+    for i, base in enumerate(bases):
+        mine = slice(15 * i, 15 * i + 15)
+        size = 1e7 if paced else 0.8**2
+        blocks[mine, mine] = wander[i] + size * base.line @ base.line.T
+    if paced:
+        paces = np.array([np.polyfit(base.line[:, 1], value, 1)[0] for base, value in zip(bases, values, strict=True)])
+        paces /= np.sqrt(np.mean(np.square(paces)))
+        eases = np.concatenate([pace * base.ease for pace, base in zip(paces, bases, strict=True)])
+        blocks += 0.8**2 * np.outer(eases, eases)
+    else:
+        blocks += 1e7
+    value = np.concatenate(values)
+    expected = blocks @ np.linalg.solve(blocks + np.eye(30), value)
+    found = smooth_alike([one[:, None] for one in values], bases, paced)
+    assert np.allclose(np.concatenate(found.made)[:, 0], expected, atol=1e-4)
+    left = found.noise**2 * (np.eye(30) - np.linalg.inv(blocks + np.eye(30)))
+    for i in range(2):
+        mine = left[15 * i : 15 * i + 15, 15 * i : 15 * i + 15]
+        assert found.left[i] == pytest.approx(np.sqrt(np.diag(mine).mean() - mine.mean()), rel=1e-3)
+        assert found.left_mean[i] == pytest.approx(np.sqrt(mine.mean()), rel=1e-3)
+
+
+def test_level_courses_tell_of_each_other_and_others_do_not() -> None:
+    time, rng = np.arange(75) / 20, np.random.default_rng(4)
+    bases = [basis(time)] * 6
+
+    def error(truth: list[np.ndarray], made: list[np.ndarray]) -> float:
+        return float(np.sqrt(np.mean([np.square(m - t).mean() for m, t in zip(made, truth, strict=True)])))
+
+    level = [np.full((75, 1), 0.7)] * 6
+    seen = [t + rng.normal(0, 0.3, t.shape) for t in level]
+    assert error(level, smooth_alike(seen, bases).made) < 0.6 * error(level, smooth(seen, bases).made)
+    apart = [offset + slope * time[:, None] for offset, slope in rng.normal(size=(6, 2))]
+    seen = [t + rng.normal(0, 0.3, t.shape) for t in apart]
+    assert error(apart, smooth_alike(seen, bases).made) < 1.05 * error(apart, smooth(seen, bases).made)
+
+
+def test_sweeps_that_set_out_and_come_to_rest_alike_are_followed() -> None:
+    """Each to its own side, from its own place, at its own pace; and even sweeps stay even."""
+    rng, times = np.random.default_rng(5), [np.arange(count) / 20 for count in (60, 75, 90, 75, 60)]
+    bases = [basis(time) for time in times]
+    for ease in (0.0, 0.6):
+        truth = []
+        for time, pace in zip(times, (1.0, -0.9, 1.1, -1.2, 0.8), strict=True):
+            u = 2 * time / time[-1] - 1
+            truth.append((rng.normal() + pace * ((1 - ease) * u + ease * (1.5 * u - 0.5 * u**3)))[:, None])
+        error, plain = [], []
+        for _ in range(4):
+            seen = [t + rng.normal(0, 0.2, t.shape) for t in truth]
+            for told, made in ((error, smooth_alike(seen, bases, paced=True).made), (plain, smooth(seen, bases).made)):
+                told.append(np.mean([np.square(m - t).mean() for m, t in zip(made, truth, strict=True)]))
+        assert np.sqrt(np.mean(error)) < (0.85 if ease else 1.1) * np.sqrt(np.mean(plain))
