@@ -35,7 +35,7 @@ class Courses(NamedTuple):
     left: list[float]
     """How far each course is expected to be from the truth but for its mean: root mean square, in the values' unit."""
     left_mean: list[float]
-    """How far its mean is expected to be from the truth's; where any line may lie anywhere, this is told of noise."""
+    """How far its mean is expected to be from the truth's, in the values' unit."""
     noise: float
     """Standard deviation of the noise, in the values' unit."""
 
@@ -114,7 +114,7 @@ class _Rest(NamedTuple):
 
     rests: list[np.ndarray]  # (T, C) of each clip, times precision, in modes
     own: list[np.ndarray]  # (T, T) of each clip: takes off what is the clip's own, and is the precision of what is left
-    common: list[np.ndarray]  # (T, K) of each clip: what is common, as far as `own` leaves it
+    common: list[np.ndarray]  # (T, K) of each clip: what is common, taken off and weighed likewise
     spread: np.ndarray  # (K, K) covariance of what is common
     noise: float
     likelihood: float
@@ -134,9 +134,10 @@ def _likeliest(modes: list[list[_Modes]], sizes: Sizes, names: tuple[str, ...]) 
     best = -np.inf
     for _ in range(_ROUNDS if names else 1):
         before = best
-        tried = [sizes._replace(length=i, swing=swing) for i in range(len(LENGTHS_S)) for swing in SWINGS]
-        for name in ("", *names):
-            for some in [_with(sizes, name, spread) for spread in SPREADS] if name else tried:
+        for name in ("swing", *names):
+            grid = SWINGS if name == "swing" else SPREADS
+            lengths = range(len(LENGTHS_S)) if name == "swing" else (sizes.length,)
+            for some in [_with(sizes, length, name, size) for length in lengths for size in grid]:
                 likelihood = _fit(modes[some.length], some).likelihood
                 if likelihood > best + _BETTER:
                     best, sizes = likelihood, some
@@ -145,9 +146,8 @@ def _likeliest(modes: list[list[_Modes]], sizes: Sizes, names: tuple[str, ...]) 
     return sizes
 
 
-def _with(sizes: Sizes, name: str, spread: float) -> Sizes:
-    values = {**sizes._asdict(), name: spread}
-    return Sizes(**values)
+def _with(sizes: Sizes, length: int, name: str, size: float) -> Sizes:
+    return Sizes(**{**sizes._asdict(), "length": length, name: size})
 
 
 def _fit(clips: list[_Modes], sizes: Sizes, whole: bool = False) -> _Rest:

@@ -63,8 +63,7 @@ def steady(tracks: list[np.ndarray], times_s: list[np.ndarray]) -> Steadied:
     if jitter_rad:
         for k, (i, turn) in enumerate(zip(long, turns, strict=True)):
             out[i][:, :3, :3] = turn
-            # A tilt that stays in camera space is none that a clip's frames share in object space, as far as the
-            # camera goes around.
+            # A tilt that stays the same in camera space differs in object space, the more the camera goes around.
             shared = np.abs(np.exp(1j * around.made[k]).mean()) ** 2
             tilted = [tilt.left[k] ** 2 + (1 - shared) * tilt.left_mean[k] ** 2 for tilt in tilts]
             off = np.sqrt(around.left[k] ** 2 * axis**2 + np.mean(tilted) * (1 - axis**2))
