@@ -16,13 +16,12 @@ PRESET    ?=
 STAGE     ?=
 VIDEO     ?=
 ARGS      ?=
-MINUTES   ?= 10
+# Bounds soak and fuzz (10 unless given) and train-networks (120)
+MINUTES   ?=
 # Evaluation data and script of your own; see benchmarks/
 DATA      ?=
 LOOK      ?= clean
 EVALUATE  ?=
-# How long train-networks trains
-MINUTES   ?= 120
 
 # On a CPU shared with others, OpenMP threads that spin while they wait make torch many times slower.
 export GOMP_SPINCOUNT ?= 2000
@@ -84,14 +83,14 @@ test: $(STAMP)  ## every test
 	$(PYTHON) -m pytest $(ARGS)
 
 soak: $(STAMP)  ## kill writers 500 times and whole runs 20 times; compare with undisturbed ones (MINUTES bounds it)
-	BANMO_SOAK_KILLS=500 BANMO_SOAK_MINUTES=$(MINUTES) $(PYTHON) -m pytest tests/crash/test_crash_soak.py -s $(ARGS)
+	BANMO_SOAK_KILLS=500 BANMO_SOAK_MINUTES=$(or $(MINUTES),10) $(PYTHON) -m pytest tests/crash/test_crash_soak.py -s $(ARGS)
 	BANMO_MODEL_EXAMPLES=400 $(PYTHON) -m pytest tests/crash/test_crash_model.py $(ARGS)
 	BANMO_RUN_KILLS=20 $(PYTHON) -m pytest tests/crash/test_crash_kill.py $(ARGS)
 	BANMO_FULL_DISKS=32 BANMO_FAULT_RUNS=16 BANMO_GC_ROUNDS=12 $(PYTHON) -m pytest tests/crash/test_crash_faults.py $(ARGS)
 	BANMO_SOAK=20 $(PYTHON) -m pytest tests/end_to_end/test_kill.py -s $(ARGS)
 
 fuzz: $(STAMP)  ## 100,000 damaged inputs for each reader of foreign files (MINUTES bounds it)
-	BANMO_FUZZ=100000 BANMO_FUZZ_MINUTES=$(MINUTES) $(PYTHON) -m pytest tests/fuzz -s $(ARGS)
+	BANMO_FUZZ=100000 BANMO_FUZZ_MINUTES=$(or $(MINUTES),10) $(PYTHON) -m pytest tests/fuzz -s $(ARGS)
 
 test-slurm: $(STAMP)  ## a real Slurm of two nodes on this machine (Debian: slurm-wlm munge); needs the superuser
 	BANMO_SLURM=1 $(PYTHON) -m pytest tests/slurm $(ARGS)
@@ -114,7 +113,7 @@ train-networks: $(STAMP)  ## train the shipped networks anew: renderings, MINUTE
 	$(PYTHON) -m synthetic.bank build/bank --category quadruped --bodies 180 --views 100 --seed 1
 	$(PYTHON) -m synthetic.bank build/bank --category human --bodies 180 --views 100 --seed 1
 	$(PYTHON) -m synthetic.bank build/bank --category thing --bodies 120 --views 25 --seed 1
-	$(PYTHON) -m training.train build/networks --bank build/bank --minutes "$(MINUTES)" --seed 0
+	$(PYTHON) -m training.train build/networks --bank build/bank --minutes "$(or $(MINUTES),120)" --seed 0
 	$(PYTHON) -m training.export build/networks/state.safetensors build/networks/weights
 	$(PYTHON) -m synthetic.bank build/bank192 --category quadruped --bodies 60 --views 30 --seed 11 --side-px 192
 	$(PYTHON) -m synthetic.bank build/bank192 --category human --bodies 60 --views 30 --seed 11 --side-px 192
