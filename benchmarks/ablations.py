@@ -96,6 +96,7 @@ def main(
     scale: float = 1.0,
     seed: int = 0,
     threads: int = 2,
+    base: tuple[str, ...] = (),
 ) -> None:
     """Reconstruct once a row and print the paper's table.
 
@@ -108,14 +109,17 @@ def main(
         scale: Multiplies every phase's number of steps.
         seed: Of every fit.
         threads: Of the processor.
+        base: Rows whose changes hold for all others, too: what a few steps leave no room for.
     """
     # a handler flushes after every line: a run that is killed keeps its rows
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     torch.set_num_threads(threads)
-    unknown = [r for r in rows if r not in ROWS]
+    unknown = [r for r in (*rows, *base) if r not in ROWS]
     if unknown:
         raise SystemExit(f"no row {unknown[0]!r}; there are {', '.join(ROWS)}")
     phases = presets(preset, scale, seed)
+    for name in base:
+        phases = changed(ROWS[name], phases)
     try:
         whole = observe(workspace, steps=phases[0].flow_steps)
     except BadInput as error:
