@@ -95,9 +95,10 @@ fuzz: $(STAMP)  ## 100,000 damaged inputs for each reader of foreign files (MINU
 test-slurm: $(STAMP)  ## a real Slurm of two nodes on this machine (Debian: slurm-wlm munge); needs the superuser
 	BANMO_SLURM=1 $(PYTHON) -m pytest tests/slurm $(ARGS)
 
-lint: $(STAMP)  ## style
+lint: $(STAMP)  ## style, layers and types
 	$(PYTHON) -m ruff check .
 	$(VENV)/bin/lint-imports
+	$(PYTHON) -m mypy pipeline stages synthetic training benchmarks
 
 bench: $(STAMP)  ## reconstruct DATA (given masks and root poses) and score it with EVALUATE
 	@test -n "$(DATA)" -a -n "$(EVALUATE)" || { echo "say which: make bench DATA=data/fox EVALUATE=evaluate.py [LOOK=clean]"; exit 2; }

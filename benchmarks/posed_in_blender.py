@@ -7,6 +7,7 @@ lists for each clip.
 
 import json
 import sys
+from typing import Any
 
 import bpy
 import numpy as np
@@ -23,7 +24,7 @@ def main(glb: str, out: str, moments: str) -> None:
     bpy.ops.import_scene.gltf(filepath=glb)
     armature = next(o for o in bpy.data.objects if o.type == "ARMATURE")
     skinned = next(o for o in bpy.data.objects if o.type == "MESH" and any(m.type == "ARMATURE" for m in o.modifiers))
-    facts = {
+    facts: dict[str, Any] = {
         "bones": {b.name: b.parent.name if b.parent else None for b in armature.data.bones},
         "cameras": sorted(o.name for o in bpy.data.objects if o.type == "CAMERA"),
         "groups": len(skinned.vertex_groups),
@@ -62,7 +63,7 @@ def main(glb: str, out: str, moments: str) -> None:
             evaluated.to_mesh_clear()
         arrays[name] = np.stack(posed)
     facts["order"] = names
-    np.savez(out, facts=json.dumps(facts), **{f"clip_{k}": arrays[n] for k, n in enumerate(names)})
+    np.savez(out, facts=json.dumps(facts), **{f"clip_{k}": arrays[n] for k, n in enumerate(names)})  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ def row(
     draw_bones(faint, project(k, transform(pose, centres)).numpy(), model.bone_parents.numpy())
     pictures.append(faint)
     rows, columns = np.nonzero(hit)
-    half = 0.62 * max(np.ptp(rows), np.ptp(columns), 16)
+    half = 0.62 * max(int(np.ptp(rows)), int(np.ptp(columns)), 16)
     middle = np.array([(rows.min() + rows.max()) / 2, (columns.min() + columns.max()) / 2])
     top, left = np.clip(middle - half, 0, None).astype(int)
     bottom, right = np.minimum(middle + half, (height, width)).astype(int)

@@ -57,7 +57,7 @@ class PromptedMaskNetwork(Network):
         """(H, W) float32 in 0..1 of an (H, W, 3) uint8 RGB image; box (4,) and clicks (N, 2) in its pixels."""
         size = self.size or multiple_of(image.shape[:2], 32)
         clicks, labels = self._prompts(box, inside, outside)
-        clicks = clicks * np.float32([size[1] / image.shape[1], size[0] / image.shape[0]])
+        clicks = clicks * np.array([size[1] / image.shape[1], size[0] / image.shape[0]], np.float32)
         shape = self.session.get_inputs()[2].shape
         given = labels.reshape((1, 1, -1, 1) if len(shape) == 4 else (1, 1, -1))
         outputs = [o.name for o in self.session.get_outputs()]
@@ -78,15 +78,15 @@ class PromptedMaskNetwork(Network):
         clicks = [np.zeros((0, 2), np.float32)]
         labels: list[float] = []
         if box is not None:
-            clicks.append(np.float32(box).reshape(2, 2))
+            clicks.append(np.asarray(box, np.float32).reshape(2, 2))
             labels += BOX_CORNERS
         for points, label in ((inside, 1.0), (outside, 0.0)):
             if points is not None and len(points):
-                clicks.append(np.float32(points).reshape(-1, 2))
+                clicks.append(np.asarray(points, np.float32).reshape(-1, 2))
                 labels += [label] * len(points)
         if not labels:
             raise BadInput(f"{self.path.name} wants a box or a click, and there is none")
-        places, kinds = np.concatenate(clicks), np.float32(labels)
+        places, kinds = np.concatenate(clicks), np.array(labels, np.float32)
         room = self.session.get_inputs()[1].shape[2]
         if isinstance(room, int):
             spare = max(0, room - len(kinds))

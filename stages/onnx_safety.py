@@ -110,7 +110,8 @@ class _Reader:
 
     def _tensor(self, start: int, end: int) -> None:
         dims: list[int] = []
-        name, raw, whole, data_type = "", b"", [], 0
+        whole: list[int] = []
+        name, raw, data_type = "", b"", 0
         for number, wire, low, high in _fields(self.data, start, end):
             if number == 13 and wire == 2:
                 self.found.outside.append(_location(self.data, low, high))

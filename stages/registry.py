@@ -129,10 +129,10 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 def keep(
     name: str,
-    bring: Callable[[Path], None],
+    bring: Callable[[Path], object],
     contract: dict[str, Any],
     facts: dict[str, str],
-    judge: Callable[[Path], None] = lambda folder: None,
+    judge: Callable[[Path], object] = lambda folder: None,
 ) -> Path:
     """Make ``<home>/<name>/`` in one step: `bring` writes the model file, `judge` may refuse the finished folder.
 

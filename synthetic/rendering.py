@@ -74,14 +74,14 @@ def draw(
     in_camera = in_room @ camera.camera_from_room[:3, :3].T + camera.camera_from_room[:3, 3]
     fragments = rasterise(in_camera, body.faces, intrinsics, height, width)
     if room is None:
-        image = np.full((height, width, 3), 0.8, np.float32)
+        image: np.ndarray = np.full((height, width, 3), 0.8, np.float32)
         light = np.array([0.3, 0.9, 0.3]) / np.linalg.norm([0.3, 0.9, 0.3])
     else:
         room_from_camera = np.linalg.inv(camera.camera_from_room)
         image = draw_room(room, room_from_camera, intrinsics, height, width, cast_shadow(room, in_room))
         light = room.light
     _paint(image, fragments, body, in_room, coat, light, look)
-    coverage = fragments.covered.astype(np.float32)
+    coverage: np.ndarray = fragments.covered.astype(np.float32)
     if supersample > 1:
         shape = (size_px[1], size_px[0])
         image = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)

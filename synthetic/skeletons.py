@@ -42,7 +42,7 @@ def main(out: Annotated[Path, tyro.conf.Positional]) -> None:
         path = out / f"{category}-skeleton.npz"
         part = path.with_name(f".{path.name}")
         with part.open("wb") as file:
-            np.savez_compressed(file, **skeleton_of(category))
+            np.savez_compressed(file, **skeleton_of(category))  # type: ignore[arg-type]
         part.replace(path)
         log.info('"%s": "%s",', path.name, hashlib.sha256(path.read_bytes()).hexdigest())
 

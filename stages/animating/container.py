@@ -53,7 +53,8 @@ def read_accessor(document: dict[str, Any], blob: bytes, index: Any) -> np.ndarr
         raise GlbError("uses sparse accessors, which are not read here")
     if accessor.get("componentType") not in _DTYPE or accessor.get("type") not in _WIDTH:
         raise GlbError("has an accessor of an unknown type")
-    dtype, width = np.dtype(_DTYPE[accessor["componentType"]]), _WIDTH[accessor["type"]]
+    dtype: np.dtype[Any] = np.dtype(_DTYPE[accessor["componentType"]])
+    width = _WIDTH[accessor["type"]]
     count, offset = accessor.get("count"), accessor.get("byteOffset", 0)
     if not isinstance(count, int) or not isinstance(offset, int) or count < 0 or offset < 0:
         raise GlbError("has an accessor without a count")

@@ -23,12 +23,13 @@ class Uncertainty(nn.Module):
         self.code = FourierCode(videos, self.channels, octaves, generator)
         encoded = 2 * (1 + 2 * self.bands)
         sizes = (encoded + self.channels, width, width, 1)
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
+        self.layers = nn.ModuleList(layers)
         with torch.no_grad():
-            for layer in self.layers:
+            for layer in layers:
                 layer.weight.normal_(0, (2 / layer.in_features) ** 0.5, generator=generator)
                 layer.bias.zero_()
-            self.layers[-1].weight.mul_(0.1)
+            layers[-1].weight.mul_(0.1)
 
     def forward(self, video_idx: Tensor, time: Tensor, unit_xy: Tensor) -> Tensor:
         """Expected error (F, P) at `unit_xy` (F, P, 2) in 0..1 of frames at `time` (F,) of videos (F,)."""

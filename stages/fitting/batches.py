@@ -28,11 +28,11 @@ class Batch(NamedTuple):
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
-        return Batch(*(None if x is None else x.to(device, non_blocking=True) for x in self))
+        return Batch._make(None if x is None else x.to(device, non_blocking=True) for x in self)
 
     def of(self, part: slice) -> Batch:
         """Some frames of the batch."""
-        return Batch(*(None if x is None else x[part] for x in self))
+        return Batch._make(None if x is None else x[part] for x in self)
 
     def pixels_of(self, columns: Tensor) -> Batch:
         """Some pixels (F, Q) of each frame."""

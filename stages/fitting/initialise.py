@@ -173,8 +173,8 @@ def set_shape(field: GridField, points: Tensor, voxel: float) -> None:
         return ((k[:, 0] * size[1] + k[:, 1]) * size[2] + k[:, 2]).numpy()
 
     solid = np.isin(code(wanted), code(keys)).reshape(field.shape)
-    spacing = tuple(float(s) for s in field.spacing.flip(0))
-    field.set_sdf(torch.from_numpy(hull.signed_distance(solid, spacing)))
+    x, y, z = (float(s) for s in field.spacing)
+    field.set_sdf(torch.from_numpy(hull.signed_distance(solid, (z, y, x))))
 
 
 def build(

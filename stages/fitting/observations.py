@@ -8,6 +8,7 @@ step s leads s kept frames ahead (behind if negative) in the same clip.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ class ObservationBuilder:
         self._rows: dict[str, list[np.ndarray]] = {}
         self._frames: dict[str, list[np.ndarray]] = {}
 
-    def _push(self, table: dict[str, list[np.ndarray]], **columns: np.ndarray) -> None:
+    def _push(self, table: dict[str, list[np.ndarray]], **columns: Any) -> None:
         for name, value in columns.items():
             table.setdefault(name, []).append(value)
 

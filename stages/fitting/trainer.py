@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -79,7 +79,8 @@ class Trainer:
     def groups(self) -> dict[str, tuple[list[torch.nn.Parameter], float]]:
         """Parameter groups by name, with their step sizes."""
         m, s = self.model, self.settings
-        sdf, colour = [], []
+        sdf: list[torch.nn.Parameter] = []
+        colour: list[torch.nn.Parameter] = []
         for name, parameter in m.field.named_parameters():
             appearance = ("colour", "embedding", "environment", "appearance")
             (colour if name.startswith(appearance) else sdf).append(parameter)
@@ -271,10 +272,10 @@ class Trainer:
         """Settings by which copies of the model are fitted: their motion and nothing else."""
         s = self.settings
         beta = max(beta_at(s, self.progress), self.model.beta_floor)
-        quiet = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
+        quiet: dict[str, Any] = {f"lr_{name}": 0.0 for name in ("sdf", "colour", "bones", "root", "focal", "delta")}
         # Where a pose ends depends on how many steps it makes more than on how many rays each step has.
         few = max(self.team.size, -(-s.frames_per_step // 2))
-        rays = {"frames_per_step": few, "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
+        rays: dict[str, Any] = {"frames_per_step": few, "pixels_per_frame": -(-2 * s.pixels_per_frame // 3)}
         steps = max(1, round(3 * s.rethink_share * s.iterations / 2))
         return replace(
             s, **quiet, **rays, iterations=steps, beta_start=beta, beta_end=beta,

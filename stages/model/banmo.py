@@ -92,6 +92,13 @@ class FrameState(NamedTuple):
 class Banmo(nn.Module):
     """The model of a collection of V videos. `base_poses` (T, 4, 4) are G_0, the initial root poses at kept frames."""
 
+    base_poses: Tensor
+    gauge: Tensor
+    surface: Tensor
+    root_free: Tensor
+    video_idx: Tensor
+    time: Tensor
+
     def __init__(
         self,
         architecture: Architecture,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
@@ -51,6 +51,8 @@ class GridField(nn.Module):
     sdf_levels = (1, 2, 4)
     colour_levels = (1, 4)
     embedding_level = 4
+    bounds: Tensor
+    spacing: Tensor
 
     def __init__(self, bounds: Tensor, voxel: float, env_channels: int) -> None:
         super().__init__()
@@ -109,7 +111,7 @@ class GridField(nn.Module):
         return (up_z @ wide.flatten(3)).reshape(*grid.shape[:2], *self.shape)
 
     def _sum(self, grids: Iterable[Tensor]) -> Tensor:
-        return sum(self._upsampled(grid) for grid in grids)
+        return cast(Tensor, sum(self._upsampled(grid) for grid in grids))
 
     def prepare(self) -> Tensor:
         """(1, 4, Z, Y, X): signed distance and colour logits summed over the levels, once an iteration."""
@@ -176,6 +178,7 @@ class MlpField(nn.Module):
     """
 
     point_bands, direction_bands = 6, 4
+    bounds: Tensor
 
     def __init__(self, bounds: Tensor, env_channels: int, depth: int = 8, width: int = 256) -> None:
         super().__init__()
@@ -184,7 +187,8 @@ class MlpField(nn.Module):
         encoded = 3 * (1 + 2 * self.point_bands)
         self.skip = depth // 2
         sizes = [encoded] + [width + (encoded if i == self.skip else 0) for i in range(1, depth)]
-        self.trunk = nn.ModuleList(nn.Linear(n, width) for n in sizes)
+        layers = [nn.Linear(n, width) for n in sizes]
+        self.trunk = nn.ModuleList(layers)
         self.sdf_head = nn.Linear(width, 1)
         self.appearance_head = nn.Linear(width, width)
         direction = 3 * (1 + 2 * self.direction_bands)
@@ -195,7 +199,7 @@ class MlpField(nn.Module):
             nn.Linear(width // 2, EMBEDDING_CHANNELS),
         )  # fmt: skip
         with torch.no_grad():
-            for i, layer in enumerate(self.trunk):
+            for i, layer in enumerate(layers):
                 layer.weight.normal_(0, math.sqrt(2 / width))
                 layer.bias.zero_()
                 if i in (0, self.skip):  # the encoding's sines start silent: a smooth sphere first

@@ -24,6 +24,8 @@ class Bones(nn.Module):
     Bones hang in a tree, listed so that a parent comes before its children; the first is the root, its own parent.
     """
 
+    parents: Tensor
+
     def __init__(self, centres: Tensor, log_scales: Tensor, parents: Tensor) -> None:
         super().__init__()
         self.register_buffer("parents", parents.clone().long())

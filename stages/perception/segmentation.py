@@ -254,7 +254,7 @@ def finish(images: np.ndarray, soft: np.ndarray, carrier: Carrier) -> Segmentati
         prior = settle_outline(prior, images[t], OUTLINE_REACH_PX * max(1.0, max(width, height) / WORK_SIDE_PX))
         cut = main_component(prior > 0.5, prior)
         union = np.count_nonzero(cut | (prior > 0.25))
-        agreement[t] = np.count_nonzero(cut & (prior > 0.75)) / max(union, 1)
+        agreement[t] = np.count_nonzero(cut & (prior > 0.75)) / max(int(union), 1)
         held = np.where(cut, np.maximum(prior, 0.51), np.minimum(prior, 0.49))
         out[t] = np.round(255 * held).astype(np.uint8)
     return Segmentation(out, agreement)

@@ -86,7 +86,7 @@ def _views_from(first: int, last: int, small: Callable[[int], tuple[np.ndarray, 
     for t in range(first, last):
         (here, _), (there, covered) = small(t), small(t + 1)
         moved, found, _ = cv2.calcOpticalFlowPyrLK(here, there, points, None, **_WINDOW)  # type: ignore[call-overload]
-        back, again, _ = cv2.calcOpticalFlowPyrLK(there, here, moved, None, **_WINDOW)
+        back, again, _ = cv2.calcOpticalFlowPyrLK(there, here, moved, None, **_WINDOW)  # type: ignore[call-overload]
         tracked &= (found[:, 0] > 0) & (again[:, 0] > 0)
         tracked &= np.linalg.norm((back - points)[:, 0], axis=1) < _ROUND_TRIP_PX
         points = moved

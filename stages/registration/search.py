@@ -156,7 +156,7 @@ def scatter(hypothesis: Hypothesis, random: np.random.Generator) -> None:
     """A random start: every clip at a random bearing, turning as its flow says or faster, slower, or backwards."""
     for k, s in enumerate(hypothesis.sequences):
         if s.bearing is not None and s.fixed is None:
-            hypothesis.posterior[k] = told(hypothesis, s, random.uniform(0.1, 1.0))
+            hypothesis.posterior[k] = told(hypothesis, s, s.bearing, random.uniform(0.1, 1.0))
             continue
         path = np.concatenate([[0.0], np.cumsum(s.drift)]) * random.uniform(0.5, 1.5)
         path = path + np.linspace(-0.5, 0.5, len(path)) * random.normal(0.0, 1.2)
@@ -164,10 +164,10 @@ def scatter(hypothesis: Hypothesis, random: np.random.Generator) -> None:
         hypothesis.posterior[k] = spread(hypothesis.bank, path + start, None, 0.25) if s.fixed is None else s.fixed
 
 
-def told(hypothesis: Hypothesis, sequence: Sequence, weight: float) -> np.ndarray:
-    """Posterior (T, A, E) of a clip by its network's bearings and its flow alone."""
+def told(hypothesis: Hypothesis, sequence: Sequence, bearing: np.ndarray, weight: float) -> np.ndarray:
+    """Posterior (T, A, E) of a clip by its network's `bearing` (T, A) and its flow alone."""
     bank = hypothesis.bank
-    likelihood = np.repeat(weight * sequence.bearing[:, :, None], len(bank.elevation), axis=2)
+    likelihood = np.repeat(weight * bearing[:, :, None], len(bank.elevation), axis=2)
     start = np.full(bank.shape, 1 / len(bank))
     steps = azimuth_steps(bank.azimuth, sequence.drift, sequence.step_sigma)
     return forward_backward(likelihood, start, steps, elevation_step(bank.elevation, np.radians(5.0)))[0]

@@ -57,7 +57,7 @@ def draw(
     k = np.diag([factor, factor, 1.0]) @ intrinsics
     fragments = rasterise(vertices_camera, surface.faces, k, height, width)
     pixels = fragments.pixels()
-    picture = np.zeros((height * width, 4), np.float32)
+    picture: np.ndarray = np.zeros((height * width, 4), np.float32)
     picture[:, :3] = 0.0 if kind in ("silhouette", "depth") else background  # so that they can be read as data
     if len(pixels):
         picture[pixels, :3] = _values(surface, vertices_camera, fragments, pixels, kind, depth_range)

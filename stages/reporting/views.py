@@ -82,7 +82,8 @@ def view_advice(azimuth_deg: np.ndarray, unseen: dict[str, float]) -> list[str]:
 
 def clip_advice(name: str, iou: list[float], mask_confidence: list[float], flags: list[list[str]]) -> list[str]:
     """Sentences about one clip, from figures of its kept frames."""
-    advice, count = [], len(iou)
+    advice: list[str] = []
+    count = len(iou)
     if not count:
         return advice
     missing = sum("missing" in f for f in flags)

@@ -6,6 +6,7 @@ import argparse
 import shutil
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +118,7 @@ def _get(args: argparse.Namespace) -> int:
             entry.digest_kind: entry.digest,
         }
         with registry.locked(name):
-            folder = registry.keep(name, bring, entry.contract, facts, lambda f, slot=entry.slot: _judge(f, slot))
+            folder = registry.keep(name, bring, entry.contract, facts, partial(_judge, slot=entry.slot))
         line.end()
         _say(f'  here: {folder}\n  use it: [{entry.slot}] network = "{name}"')
     return 0

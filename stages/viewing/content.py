@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from stages.animating.adding import pack_glb
 from stages.animating.playing import ROOT_MOTION, Player
 from stages.checkpoint import Checkpoints
 from stages.meshing.pictures import joint_palette
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LOOKS = ("colour", "bones' skin", "what was seen", "shape")
 _UNSEEN = np.array([0.86, 0.22, 0.28])
@@ -135,7 +139,7 @@ class Growing:
         return True
 
 
-def _rest_shape(tensors: dict[str, object], description: dict[str, object], resolution: int) -> Shown | None:
+def _rest_shape(tensors: dict[str, Tensor], description: dict[str, Any], resolution: int) -> Shown | None:
     """The canonical surface of a model that is being fitted, in its colours; None while it has no surface."""
     import torch
     from skimage.measure import marching_cubes
@@ -143,7 +147,7 @@ def _rest_shape(tensors: dict[str, object], description: dict[str, object], reso
     from stages.fitting.surface import sample_volume
     from stages.model.banmo import Banmo
 
-    model = Banmo.restore(tensors, description)  # type: ignore[arg-type]
+    model = Banmo.restore(tensors, description)
     volume, low, spacing = sample_volume(model, resolution)
     if not volume.min() < 0 < volume.max():
         return None
